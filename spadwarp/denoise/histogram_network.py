@@ -227,7 +227,7 @@ class HistogramNet(nn.Module):
             between = _interpolation(found.shape[-1], bins, found.device)
             score = found[-1] @ between
             for weight, volume in zip(F.softplus(found[:-1]), volumes, strict=True):
-                score = score + (weight @ between) * volume
+                score = torch.addcmul(score, weight @ between, volume)
             return score.log_softmax(dim=-1), target[:, :height, :width].float()
 
     def _weighed(self, cells: Tensor, images: Tensor) -> tuple[Tensor, Tensor]:
@@ -296,28 +296,32 @@ def _interpolation(cells: int, bins: int, device: torch.device) -> Tensor:
 _FINE = 13  # places over the three bins about the highest one
 
 
-def mean_depth(log_probability: Tensor) -> Tensor:
+def mean_depth(log_probability: Tensor, probability: Tensor) -> Tensor:
     """Mean depth over the gate, `[B, H, W]`.
 
     Within the highest bin and its two neighbours the logarithm is a parabola: the return of many photons is narrower
     than a bin.
     """
     bins = log_probability.shape[-1]
-    place = (torch.arange(bins, device=log_probability.device) + 0.5) / bins
     middle = log_probability.argmax(dim=-1, keepdim=True).clamp(1, max(1, bins - 2))
-    steps = torch.arange(-1, 2, device=place.device)
+    steps = torch.arange(-1, 2, device=middle.device)
     before, at, after = log_probability.gather(-1, (middle + steps).clamp(0, bins - 1)).split(1, dim=-1)
-    offset = torch.linspace(-1.5, 1.5, _FINE, device=place.device)
+    offset = torch.linspace(-1.5, 1.5, _FINE, device=middle.device)
     parabola = 0.5 * (after - before) * offset + (0.5 * (after + before) - at) * offset.square()
     fine = torch.softmax(parabola, dim=-1) @ offset
     early, late = before.exp()[..., 0], after.exp()[..., 0]
-    return log_probability.exp() @ place + ((early + at.exp()[..., 0] + late) * fine - (late - early)) / bins
+    return probability @ _places(probability) + ((early + at.exp()[..., 0] + late) * fine - (late - early)) / bins
+
+
+def _places(probability: Tensor) -> Tensor:
+    """Middles of bins over the gate."""
+    bins = probability.shape[-1]
+    return (torch.arange(bins, device=probability.device) + 0.5) / bins
 
 
 def answer(log_probability: Tensor) -> tuple[Tensor, Tensor]:
     """Mean depth over the gate, and the probability that the depth is right to `CLOSE` of it, `[B, H, W]`."""
-    bins = log_probability.shape[-1]
-    place = (torch.arange(bins, device=log_probability.device) + 0.5) / bins
-    depth = mean_depth(log_probability)
-    near = (place - depth[..., None]).abs() <= max(CLOSE, 0.5 / bins)
-    return depth, (log_probability.exp() * near).sum(dim=-1)
+    probability = log_probability.exp()
+    depth = mean_depth(log_probability, probability)
+    near = (_places(probability) - depth[..., None]).abs() <= max(CLOSE, 0.5 / probability.shape[-1])
+    return depth, probability.mul_(near).sum(dim=-1)

@@ -44,6 +44,7 @@ METHODS = (*MODELS, *(name for name in BASELINES if name != "input"), *CLASSICAL
 # with the noise of the training; its probabilities are too low on thin structures.
 _TARGET_FROM = {"pyramid": 0.08}
 
+_ROWS = 64  # whose counts are summed at once: little memory
 _PIXELS_AT_ONCE = {"cpu": 1 << 16, "cuda": 1 << 23}  # a batch that fits into a CPU's cache is faster
 
 
@@ -200,14 +201,19 @@ def detected(
         return cube
 
     frames = counts.reshape(-1, *counts.shape[-3:])
-    known = np.maximum(summed(np.broadcast_to(background, frames.shape[1:]).astype(np.float64)), 0.0)
+    known, height = np.broadcast_to(background, frames.shape[1:]), frames.shape[1]
     significance = np.empty(frames.shape[:-1], np.float32)
-    options: dict[str, Any] = {"background": known, "level_known": level_known, "device": "cpu"}
+    options: dict[str, Any] = {"level_known": level_known, "device": "cpu"}
     half = np.flatnonzero(response >= 0.5 * np.max(response))
     width = (half[-1] - half[0] + 1) * (1.0 - 1e-9)  # bins, and not one more by rounding
     options["irf"] = InstrumentResponse(sigma=width * 1e-12 / FWHM_PER_SIGMA)
-    for cube, out in zip(frames, significance, strict=True):
-        arrival_time(summed(cube.astype(np.int64)), gate_start=0.0, bin_width=1e-12, significance=out, **options)
+    for top in range(0, height, _ROWS):
+        first, stop = max(0, top - side // 2), top + _ROWS + side // 2
+        inner = slice(top - first, top - first + _ROWS)
+        options["background"] = np.maximum(summed(known[first:stop].astype(np.float64))[inner], 0.0)
+        for cube, image in zip(frames, significance, strict=True):
+            some, out = summed(cube[first:stop].astype(np.int64))[inner], image[top : top + _ROWS]
+            arrival_time(some, gate_start=0.0, bin_width=1e-12, significance=out, **options)
     significance = significance.reshape(found.depth.shape)
     depth = np.where(significance >= least, found.depth, np.float32(np.nan))
     probability = np.where(significance >= least, found.target_probability, np.float32(0.0))

@@ -74,7 +74,7 @@ def histogram_loss(log_probability: Tensor, target: Tensor, batch: Batch) -> Ten
     """
     hit, clean, bins = batch.hit[:, 0], batch.clean[:, 0], log_probability.shape[-1]
     pixels = hit.flatten(1).sum(dim=1).clamp_min(1.0)
-    depth = mean_depth(log_probability)
+    depth = mean_depth(log_probability, log_probability.exp())
     square = (hit * (depth - clean).square()).flatten(1).sum(dim=1) / pixels
     middle = (clean * bins).long().clamp(0, bins - 1)[..., None]
     middle = (middle + torch.arange(-1, 2, device=middle.device)).clamp(0, bins - 1)
