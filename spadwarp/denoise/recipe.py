@@ -79,7 +79,7 @@ class Noise(Section):
         0.0, description="of these, samples with a background, and with a response, that are not known well"
     )
     resampled: Share = Field(
-        0.0, description="samples whose depth was resampled, so that pixels at edges lie between both surfaces"
+        0.0, description="samples whose depth is the mean over each pixel: at edges it lies between both surfaces"
     )
     sparse: Share = Field(0.25, description="samples in which only 3 to 100 % of the pixels report anything")
     tail: Share = Field(0.15, description="samples whose jitter has a late tail, as avalanche photodiodes have")

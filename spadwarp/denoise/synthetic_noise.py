@@ -448,12 +448,10 @@ def _draw_crops(scenes: CleanScenes, noise: Noise, crop: int, random: Random, fi
     seen, bound = _cut(scenes, index, crop, random, finer)
     depth, sigma = (image[:, seen.shape[1] // 2] for image in (seen, bound))
     if noise.resampled > 0.0:
-        chosen = random.coin(noise.resampled, 1, 1)
-        shift = 0.5 * random.uniform(2, 1, 1) * chosen[:, None]
-        depth, sigma = (_resampled(image, shift) for image in (depth, sigma))
-        seen, bound = (
-            torch.where(chosen[..., None], one[:, None], all_) for one, all_ in ((depth, seen), (sigma, bound))
-        )
+        chosen = random.coin(noise.resampled, 1, 1, 1)
+        means = (image.nanmean(dim=1, keepdim=True) for image in (seen, bound))
+        seen, bound = (torch.where(chosen, *pair) for pair in zip(means, (seen, bound), strict=True))
+        depth, sigma = (image[:, seen.shape[1] // 2] for image in (seen, bound))
     hit = torch.isfinite(depth) & torch.isfinite(sigma)
     gate = scenes.gate[index]
     own = random.coin(noise.own_gate)
@@ -498,15 +496,6 @@ def _cut(scenes: CleanScenes, index: Tensor, crop: int, random: Random, finer: i
     depth, sigma = (values[where].flatten(1, 2) for values in scenes[:2])
     transposed = random.coin(0.5)[:, None, None, None]
     return torch.where(transposed, depth.mT, depth), torch.where(transposed, sigma.mT, sigma)
-
-
-def _resampled(image: Tensor, shift: Tensor) -> Tensor:
-    """An image `[B, h, w]` shifted by parts of a pixel `[B, 2, 1, 1]`, by bilinear interpolation of what is there."""
-    for axis in (1, 2):
-        next_one = torch.cat([image.narrow(axis, 1, image.shape[axis] - 1), image.narrow(axis, -1, 1)], dim=axis)
-        moved = torch.lerp(image, next_one, shift[:, axis - 1])
-        image = torch.where(torch.isfinite(moved), moved, image)
-    return image
 
 
 def _extent(depth: Tensor, hit: Tensor, gate: Tensor) -> tuple[Tensor, Tensor]:

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 import torch
 
-from spadwarp.denoise import samples
+from spadwarp.denoise import samples, synthetic_noise
 from spadwarp.denoise.recipe import Noise, Optimiser, Part, TrainingRecipe
 from spadwarp.denoise.samples import Sizes, crowded, in_open_water
 from spadwarp.denoise.synthetic_noise import SUBPIXELS, Batch, CleanScenes, draw_batch, procedural_scenes
@@ -106,3 +106,18 @@ def test_of_two_scenes_a_pixel_sees_the_nearer():
     assert (((both.depth > low) & (both.depth < high)) | ~seen).all()
     wall = CleanScenes(torch.ones(3, 8, 8), torch.ones(3, 8, 8), torch.ones(3, 2), torch.ones(3, 64))
     assert in_open_water(wall) is wall  # which has no open water
+
+
+def test_a_response_that_is_not_known_fits_best_where_the_return_is():
+    """Counts of the true response, matched with the one that is given at every bin and between; tails do not move it."""
+    random = synthetic_noise.Random(200, torch.Generator().manual_seed(2))
+    response = synthetic_noise._draw_response(random)
+    true = response.per_bin()
+    assert (true >= 0).all() and ((response.tail > 0).float().mean() - 0.4).abs() < 0.15
+    given, at = synthetic_noise._wrong_response(true, random)
+    shifts = torch.arange(-8, 9.0) * 0.5
+    counts = response.per_bin(-at)
+    fit = torch.stack([(counts * (given.per_bin(shift) + 0.01).log()).sum(dim=1) for shift in shifts])
+    assert (shifts[fit.argmax(dim=0)] == 0).float().mean() > 0.95  # less where only fractions of a bin differ
+    deviation = [(one * torch.arange(-32, 33.0).square()).sum(dim=1).sqrt() for one in (true, given.per_bin())]
+    assert 0.3 < (deviation[1] / deviation[0]).min() < 0.7 and 1.5 < (deviation[1] / deviation[0]).max() < 2.2
