@@ -298,8 +298,8 @@ KINDS = (_plate, _ellipsoid, _rod, _rope, _net, _ladder, _plant, _chain, _rock, 
 BINS = 64
 """Bins of a backscatter profile over the gate."""
 
-COUNT_BINS = (64, 96, 128, 192, 256, 400)
-"""Bins of the histograms behind frames with few photons, one number for each batch."""
+COUNT_BINS = (36, 60, 100, 150, 230, 370)
+"""Bins of histograms, one number for each batch: no whole strides, as gates are narrowed to what holds the target."""
 
 _RARER = 1.5  # power of a uniform number: low backscatter fractions are drawn more often than high ones
 _WRONG = (0.5, 2.0)  # factors on a background, and on the width of a response, that are not known well
