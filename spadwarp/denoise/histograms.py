@@ -84,13 +84,22 @@ def without_defects(counts: ArrayLike, background: ArrayLike | BackgroundLaw, re
     return Usable(cubes, levels, taps, found, estimated)
 
 
+_FEWEST = 64
+
+
 def target_bins(
     counts: NDArray[Any], background: NDArray[Any], response: NDArray[Any], gate: tuple[float, float]
 ) -> tuple[int, int, tuple[float, float]]:
-    """First and last bin of the part of the gate that holds the target, and that part in depth [m]."""
+    """First and last bin of the part of the gate that holds the target, and that part in depth [m].
+
+    Of at least `_FEWEST` bins, if the gate has so many: the network knows few histograms with less.
+    """
     cubes, levels, taps = checked_histograms(counts, background, response)
     first, stop = bins_of_target(cubes, levels, taps)
-    width = (gate[1] - gate[0]) / cubes.shape[-1]
+    bins = cubes.shape[-1]
+    first = max(0, min(first - max(0, _FEWEST - (stop - first)) // 2, bins - _FEWEST))
+    stop = min(bins, max(stop, first + _FEWEST))
+    width = (gate[1] - gate[0]) / bins
     return first, stop, (gate[0] + first * width, gate[0] + stop * width)
 
 
