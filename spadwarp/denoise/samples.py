@@ -7,7 +7,15 @@ import torch
 from torch import Tensor
 
 from spadwarp.denoise.recipe import Part, TrainingRecipe
-from spadwarp.denoise.synthetic_noise import BINS, COUNT_BINS, SUBPIXELS, Batch, CleanScenes, draw_batch, procedural_scenes
+from spadwarp.denoise.synthetic_noise import (
+    BINS,
+    COUNT_BINS,
+    SUBPIXELS,
+    Batch,
+    CleanScenes,
+    draw_batch,
+    procedural_scenes,
+)
 
 _WATER = (0.03, 0.85)  # part of a scene that is target, where it counts as a target in open water
 

@@ -109,7 +109,7 @@ def test_of_two_scenes_a_pixel_sees_the_nearer():
 
 
 def test_a_response_that_is_not_known_fits_best_where_the_return_is():
-    """Counts of the true response, matched with the one that is given at every bin and between; tails do not move it."""
+    """Counts of the true response, matched with the one that is given at half bins; tails do not move it."""
     random = synthetic_noise.Random(200, torch.Generator().manual_seed(2))
     response = synthetic_noise._draw_response(random)
     true = response.per_bin()
