@@ -31,9 +31,8 @@ from spadwarp.denoise.recipe import LEAST_CROP, LEVELS, Noise, TrainingRecipe
 from spadwarp.denoise.samples import Samples, Sizes
 from spadwarp.denoise.synthetic_noise import Batch, CleanScenes, draw_batch, procedural_scenes
 from spadwarp.io.paths import atomic_path
-from spadwarp.io.text import parse_json
 from spadwarp.parallel import interruptible
-from spadwarp.values import ConfigError, FileError, SpadwarpWarning, environment_integer
+from spadwarp.values import ConfigError, FileError, environment_integer
 
 # The loss: the error of depth, and of the network's other answers.
 
@@ -132,14 +131,6 @@ def _learning_rate(step: int, recipe: TrainingRecipe) -> float:
     rise = min(1.0, (step + 1) / max(settings.warm_up, 1))
     fall = 0.5 * (1.0 + math.cos(math.pi * step / settings.steps))
     return settings.learning_rate * rise * (0.01 + 0.99 * fall)
-
-
-def _is_report(line: str) -> bool:
-    try:
-        report = parse_json(line)
-    except ValueError:
-        return False
-    return isinstance(report, dict) and {"step", "loss", "psnr"} <= report.keys() and isinstance(report["psnr"], dict)
 
 
 def _difference(stored: Any, recipe: TrainingRecipe) -> str:
@@ -260,10 +251,7 @@ class Run:
             reports = kept["step"] // settings.interval
             if kept["step"] == settings.steps:
                 reports = math.ceil(kept["step"] / settings.interval)
-            found = self.log.read_text(errors="replace").splitlines(keepends=True)[:reports]
-            if len(lines := [line for line in found if _is_report(line)]) < len(found):
-                text = f"{self.log}: damaged; {len(found) - len(lines)} of its lines are left out"
-                warnings.warn(text, SpadwarpWarning, stacklevel=2)
+            lines = self.log.read_text(errors="replace").splitlines(keepends=True)[:reports]
             with atomic_path(self.log) as temporary:
                 temporary.write_text("".join(lines))
         self.loss_sum += kept.get("loss_sum", 0.0)
