@@ -8,7 +8,6 @@ from torch import Tensor
 
 from spadwarp.denoise.recipe import Part, TrainingRecipe
 from spadwarp.denoise.synthetic_noise import (
-    BINS,
     COUNT_BINS,
     SUBPIXELS,
     Batch,
@@ -67,7 +66,7 @@ class Samples:
         self.recipe, self.scenes, self.size = recipe, scenes, size
         self.generator, self.histograms = generator, histograms
         self.parts = recipe.parts()
-        self.part, self.bins = self.parts[0], BINS
+        self.part, self.bins = self.parts[0], COUNT_BINS[0]
         self.now: CleanScenes | None = None
         self.held: CleanScenes | None = None
 
@@ -76,8 +75,8 @@ class Samples:
         if self.histograms:
             host = np.random.default_rng((self.recipe.seed, self.scenes.rank, step))
             self.part = self.parts[host.choice(len(self.parts), p=[part.share for part in self.parts])]
-            seldom = np.sqrt(COUNT_BINS)  # as many bins take as much more time
-            self.bins = int(host.choice(COUNT_BINS, p=seldom**-1 / (seldom**-1).sum()))
+            often = 1.0 / np.array(COUNT_BINS)  # many bins take as much more time
+            self.bins = int(host.choice(COUNT_BINS, p=often / often.sum()))
             if host.random() < self.part.open_water:
                 now = in_open_water(now)
             if host.random() < self.part.crowded:

@@ -298,8 +298,8 @@ KINDS = (_plate, _ellipsoid, _rod, _rope, _net, _ladder, _plant, _chain, _rock, 
 BINS = 64
 """Bins of a backscatter profile over the gate."""
 
-COUNT_BINS = (36, 60, 100, 150, 230, 370)
-"""Bins of histograms, one number for each batch: no whole strides, as gates are narrowed to what holds the target."""
+COUNT_BINS = (64, 96, 128, 192, 256, 400)
+"""Bins of the histograms behind frames with few photons, one number for each batch."""
 
 _RARER = 1.5  # power of a uniform number: low backscatter fractions are drawn more often than high ones
 _WRONG = (0.5, 2.0)  # factors on a background, and on the width of a response, that are not known well
@@ -555,7 +555,7 @@ class _Response(NamedTuple):
 
 
 def _draw_response(random: Random) -> _Response:
-    width, ratio = random.log_between((0.6, 8.0), 1), random.log_between((1.0, 3.0), 1)
+    width, ratio = random.log_between((0.6, 3.6), 1), random.log_between((1.0, 3.0), 1)
     ratio = torch.where(random.coin(0.5, 1), 1.0, torch.where(random.coin(0.8, 1), ratio, 1.0 / ratio))
     wide = 0.3 * random.uniform(1) * random.coin(0.3, 1)
     tail = random.between((0.05, 0.8), 1) * random.coin(0.4, 1)
