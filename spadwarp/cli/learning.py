@@ -66,9 +66,9 @@ def dataset(
 def train(recipe: Path, *, out: Path, overrides: list[str] | None = None, device: str | None = None) -> None:
     """Train a denoiser on scenes that are drawn as it goes, or on the clean scenes of a dataset.
 
-    New noise is drawn for each step; with a pool, as in the recipe for histograms, a sample serves several. Writes
-    weights (safetensors), log.jsonl, curves.png and a checkpoint, also at Ctrl-C or SIGTERM; the same command resumes
-    the training. Another recipe needs a new folder. On several GPUs: torchrun --nproc-per-node N -m spadwarp train ...
+    New noise is drawn for each step. Writes weights (safetensors), log.jsonl, curves.png and a checkpoint, also at
+    Ctrl-C or SIGTERM; the same command resumes the training. Another recipe needs a new folder. On several GPUs:
+    torchrun --nproc-per-node N -m spadwarp train ...
 
     Args:
         recipe (RECIPE): Training recipe (TOML), or the name of one of `spadwarp list training`.

@@ -136,8 +136,8 @@ def classical_depth(
     if method == "pooled" and tuning is not None and tuning % 2 != 1:
         raise ArgumentError(f"tuning = {tuning:g} is not an odd number of pixels, such as {TUNINGS[method]}")
     torch = require_torch()
-    from spadwarp.denoise.classical import JUMPS, aggregate, beliefs, total_variation, usual_jump
-    from spadwarp.denoise.histogram_features import highest, log_likelihood, pooled
+    from spadwarp.denoise.classical import JUMP, aggregate, beliefs, highest, pooled, total_variation, usual_jump
+    from spadwarp.denoise.histogram_network import log_likelihood
 
     found = []
     with torch.inference_mode():
@@ -146,10 +146,9 @@ def classical_depth(
             if method == "pooled":
                 score = pooled(score, int(tuning or 7))
             elif method == "semi-global":
-                jump = usual_jump(score)
-                score = aggregate(score, jump=jump if tuning is None else torch.full_like(jump, tuning))
+                score = aggregate(score, jump=usual_jump(score) if tuning is None else tuning)
             elif method == "belief-propagation":
-                score = beliefs(score, score.new_full((1, 1, 1, 1), JUMPS[0] if tuning is None else tuning))
+                score = beliefs(score, JUMP if tuning is None else tuning)
             depth = highest(score)
             if method == "total-variation":
                 weight = score.amax(dim=-1).clamp(0.0, 20.0)

@@ -454,11 +454,9 @@ def _from_counts(
         time = start + place.astype(np.float64) * (some.shape[-1] * width)
         return depth_at(time, histograms, group_index)
 
-    if profile is None or some.shape[-1] < counts.shape[-1]:
-        profile = backscatter_profile(dataclasses.replace(histograms, values=some, background=level))
     found = estimate_histograms(
         read.depth, counts, known, response, bins=slice(first, stop), gate=part, model=model, to_depth=to_depth,
-        profile=profile, weights=weights, device=device,
+        weights=weights, device=device,
     )  # fmt: skip
     near, far = (to_depth(np.full_like(found.depth, place)) for place in (0.0, 1.0))
     place = ((found.depth - near) / (far - near)).reshape(some.shape[:-1])  # depth is linear in the place

@@ -23,27 +23,17 @@ LOG_DENSITY_LIMIT = 4.0
 MARGIN = 0.25
 """Depths this part of the gate's width before or behind it are still taken: a gate in range is not one in depth."""
 
-POOLED = 10
-"""Number of depths among the features of histograms: see `spadwarp.denoise.histogram_features`."""
-
-SCORED = 4
-"""Volumes whose log-likelihood of each of these depths is among the features: of three windows, and beliefs."""
-
-SIDES = 8
-"""Number of depths that are the last of these features: see `spadwarp.denoise.histogram_features`."""
-
 SMALLEST_SIDE = 8
 """Fewest rows or columns of a frame."""
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class DepthFrames:
-    """Depth frames `[N, H, W]` with their gate, and what is known of the water and of the histograms behind them."""
+    """Depth frames `[N, H, W]` with their gate, and what is known of the water."""
 
     depth: NDArray[np.float32]  # [m]; NaN where nothing was reported, or nothing near the gate
     gate: tuple[float, float]  # start and stop in depth [m]
     density: NDArray[np.float32]  # of the water's backscatter at each depth, relative to a flat one; 1 if not known
-    features: NDArray[np.float32] | None = None  # of `histogram_features`, but with its depths in metres
 
     @property
     def gate_middle(self) -> float:
@@ -56,27 +46,18 @@ class DepthFrames:
         start, stop = self.gate
         return ((self.depth - start) / (stop - start)).astype(np.float32)
 
-    def network_input(self, *, histograms: bool = False, fills: bool = False) -> NDArray[np.float32]:
-        """Channels for a network (see `spadwarp.denoise.networks`), with `histograms` also their features.
+    def network_input(self) -> NDArray[np.float32]:
+        """Channels for a network that does not see which pixels reported: see `spadwarp.denoise.networks`.
 
-        `fills`: for networks that do not see which pixels reported: missing ones get the nearest depth where those
-        around them report nearly as often as elsewhere.
+        Missing ones get the nearest depth where those around them report nearly as often as elsewhere.
         """
         scaled = self.scaled
-        if fills:
-            for depth, level in zip(scaled, self.density, strict=True):
-                depth[:] = depth[_fill_source(depth, level)]
+        for depth, level in zip(scaled, self.density, strict=True):
+            depth[:] = depth[_fill_source(depth, level)]
         reported = ~np.isnan(scaled)
         log_density = np.log(np.clip(self.density, math.exp(-LOG_DENSITY_LIMIT), math.exp(LOG_DENSITY_LIMIT)))
         channels = (np.where(reported, scaled, 1.0), reported, np.where(reported, log_density, 0.0))
-        frame = np.stack([channel.astype(np.float32) for channel in channels], axis=1)
-        if not histograms:
-            return frame
-        assert self.features is not None
-        start, stop = self.gate
-        pooled, rest, sides = np.split(self.features, [POOLED, -SIDES], axis=1)
-        pooled, sides = ((part - start) / (stop - start) for part in (pooled, sides))
-        return np.concatenate([frame, pooled - 0.5, rest, sides], axis=1, dtype=np.float32)
+        return np.stack([channel.astype(np.float32) for channel in channels], axis=1)
 
 
 def checked_gate(gate: tuple[float, float]) -> tuple[float, float]:
@@ -111,7 +92,6 @@ def depth_frames(
     gate: tuple[float, float],
     profile: ArrayLike | None = None,
     density: ArrayLike | None = None,
-    features: NDArray[np.float32] | None = None,
 ) -> DepthFrames:
     """Checks depth `[H, W]` or `[N, H, W]` [m] and brings it into the form that denoisers take.
 
@@ -128,10 +108,6 @@ def depth_frames(
         raise ArgumentError(
             f"depth is {len(values)} frames of {values.shape[1]} x {values.shape[2]} pixels; at least one frame of "
             f"{SMALLEST_SIDE} x {SMALLEST_SIDE} pixels is needed"
-        )
-    if features is not None and (len(features) != len(values) or features.shape[2:] != values.shape[1:]):
-        raise ArgumentError(
-            f"histograms are {len(features)} frames of {features.shape[2:]} pixels, depth is {values.shape}"
         )
     start, stop = checked_gate(gate)
     if (values[np.isfinite(values)] < 0).any():
@@ -156,7 +132,7 @@ def depth_frames(
         bins = checked_profile(profile)
         index = np.nan_to_num((values - start) / (stop - start)) * bins.size
         relative = (bins / bins.mean())[np.clip(index.astype(np.int64), 0, bins.size - 1)].astype(np.float32)
-    return DepthFrames(depth=values, gate=(start, stop), density=relative, features=features)
+    return DepthFrames(depth=values, gate=(start, stop), density=relative)
 
 
 def _fill_source(depth: NDArray[np.float32], density: NDArray[np.float32]) -> tuple[NDArray[np.intp], NDArray[np.intp]]:

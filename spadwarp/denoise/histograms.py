@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -11,7 +11,6 @@ from numpy.typing import ArrayLike, NDArray
 
 from spadwarp.arrays import on_host, real_array
 from spadwarp.denoise.defects import Defects, find_defects, repaired
-from spadwarp.denoise.frames import POOLED, SIDES
 from spadwarp.denoise.network_files import require_torch, torch_device
 from spadwarp.frames.backgrounds import Background, BackgroundLaw, bins_of_target, estimate_background
 from spadwarp.frames.measured import Histograms
@@ -20,42 +19,10 @@ from spadwarp.values import ArgumentError, percent
 __all__ = ["second_return"]
 
 
-def features_of_histograms(
-    counts: ArrayLike,
-    *,
-    background: ArrayLike,
-    response: ArrayLike,
-    device: str | None = None,
-    total: ArrayLike | None = None,
-    to_depth: Callable[[NDArray[np.float32]], NDArray[Any]] | None = None,
-) -> NDArray[np.float32]:
-    """Features of histograms over the gate, as `spadwarp.denoise.histogram_features` makes them, frame by frame.
-
-    float32 `[N, FEATURES, H, W]`; depths among them as parts of the gate, or as what `to_depth` makes of those
-    `[N, n, H, W]`. Arguments and errors are those of `spadwarp.denoise.estimate`; `total`: counts of each pixel, also
-    beyond the bins given here, `[H, W]` or `[N, H, W]`.
-    """
-    torch = require_torch()
-    from spadwarp.denoise.histogram_features import extract_features
-
-    with torch.inference_mode():
-        parts = histogram_tensors(counts, background, response, device)
-        images = None if total is None else np.asarray(total, np.float32).reshape(-1, *np.shape(counts)[-3:-1])
-        found = []
-        for number, part in enumerate(parts):
-            image = None if images is None else torch.from_numpy(images[number : number + 1]).to(part[0].device)
-            found.append(extract_features(*part, image).cpu().numpy())
-        features = np.concatenate(found)
-    if to_depth is not None:
-        for channels in (slice(0, POOLED), slice(-SIDES, None)):
-            features[:, channels] = to_depth(features[:, channels])
-    return features
-
-
 def histogram_tensors(
     counts: ArrayLike, background: ArrayLike, response: ArrayLike, device: str | None
 ) -> Iterator[tuple[Any, Any, Any]]:
-    """Counts `[1, H, W, T]`, background and response of each frame as `extract_features` takes them."""
+    """Counts `[1, H, W, T]`, background and response of each frame as the network takes them."""
     torch = require_torch()
     cubes, levels, taps = checked_histograms(counts, background, response)
     place = torch_device(device)
@@ -117,13 +84,22 @@ def without_defects(counts: ArrayLike, background: ArrayLike | BackgroundLaw, re
     return Usable(cubes, levels, taps, found, estimated)
 
 
+_FEWEST = 64
+
+
 def target_bins(
     counts: NDArray[Any], background: NDArray[Any], response: NDArray[Any], gate: tuple[float, float]
 ) -> tuple[int, int, tuple[float, float]]:
-    """First and last bin of the part of the gate that holds the target, and that part in depth [m]."""
+    """First and last bin of the part of the gate that holds the target, and that part in depth [m].
+
+    Of at least `_FEWEST` bins, if the gate has so many: the network knows few histograms with less.
+    """
     cubes, levels, taps = checked_histograms(counts, background, response)
     first, stop = bins_of_target(cubes, levels, taps)
-    width = (gate[1] - gate[0]) / cubes.shape[-1]
+    bins = cubes.shape[-1]
+    first = max(0, min(first - max(0, _FEWEST - (stop - first)) // 2, bins - _FEWEST))
+    stop = min(bins, max(stop, first + _FEWEST))
+    width = (gate[1] - gate[0]) / bins
     return first, stop, (gate[0] + first * width, gate[0] + stop * width)
 
 
@@ -173,7 +149,8 @@ def second_return(
         side: Of the window over which histograms are pooled; 1 for each pixel alone.
     """
     torch = require_torch()
-    from spadwarp.denoise.histogram_features import highest, pooled, toeplitz
+    from spadwarp.denoise.classical import highest, pooled
+    from spadwarp.denoise.histogram_network import toeplitz
 
     first, cubes = real_array("depth", depth), np.asarray(on_host(counts))
     if first.shape != cubes.shape[:-1]:

@@ -13,15 +13,13 @@ from numpy.typing import ArrayLike, NDArray
 from spadwarp.denoise.baselines import BASELINES, CLASSICAL, MEDIAN_WINDOWS, classical_depth, median_filter
 from spadwarp.denoise.frames import (
     MARGIN,
-    SMALLEST_SIDE,
     DepthFrames,
     checked_gate,
-    checked_profile,
     depth_frames,
     depth_values,
     narrowed_input,
 )
-from spadwarp.denoise.histograms import features_of_histograms, target_bins, without_defects
+from spadwarp.denoise.histograms import histogram_tensors, target_bins, without_defects
 from spadwarp.denoise.network_files import MODELS, Precision, fast_precision, load_network, require_torch, torch_device
 from spadwarp.frames.backgrounds import BackgroundLaw, profile_of_depth
 from spadwarp.frames.depth import arrival_time
@@ -46,6 +44,7 @@ METHODS = (*MODELS, *(name for name in BASELINES if name != "input"), *CLASSICAL
 # with the noise of the training; its probabilities are too low on thin structures.
 _TARGET_FROM = {"pyramid": 0.08}
 
+_ROWS = 64  # whose counts are summed at once: little memory
 _PIXELS_AT_ONCE = {"cpu": 1 << 16, "cuda": 1 << 23}  # a batch that fits into a CPU's cache is faster
 
 
@@ -113,7 +112,7 @@ def estimate(
     Args:
         depth, gate: See `apply`.
         model: "pyramid", "dncnn" or "usdn"; or a baseline: "median", "gating", "bm3d". With counts, "pyramid" means
-            "histograms", the variant of PyramidNet that uses them; "likelihood", "pooled", "semi-global",
+            "histograms", the network that uses them; "likelihood", "pooled", "semi-global",
             "total-variation" and "belief-propagation" are classical estimates from counts.
         profile: The water's backscatter over the gate in equal bins, `[bins]`, in any unit; default: estimated
             from depths that clearly decay beside those of targets, else flat. PyramidNet and gating use it.
@@ -164,17 +163,13 @@ def estimate(
         first, stop, part = target_bins(cubes, levels, taps, gate)
         if model not in CLASSICAL and _leaves_frames_empty(depth, gate, part):
             first, stop, part = 0, cubes.shape[-1], gate
-        if profile is not None and (first, stop) != (0, cubes.shape[-1]):
-            bins = checked_profile(profile)
-            begin, end = (int(edge / cubes.shape[-1] * len(bins)) for edge in (first, stop))
-            profile = bins[begin : max(1, end)]
 
         def to_depth(place: NDArray[np.float32]) -> NDArray[np.float32]:
             return part[0] + (part[1] - part[0]) * place
 
         found = estimate_histograms(
             depth, cubes, levels, taps, bins=slice(first, stop), gate=part, model=model, to_depth=to_depth,
-            profile=profile, weights=weights, device=device,
+            weights=weights, device=device,
         )  # fmt: skip
         given: dict[str, Any] = {"min_significance": min_significance, "level_known": not isinstance(background, str)}
         found = detected(found, cubes, levels, taps, model=model, **given)
@@ -206,14 +201,19 @@ def detected(
         return cube
 
     frames = counts.reshape(-1, *counts.shape[-3:])
-    known = np.maximum(summed(np.broadcast_to(background, frames.shape[1:]).astype(np.float64)), 0.0)
+    known, height = np.broadcast_to(background, frames.shape[1:]), frames.shape[1]
     significance = np.empty(frames.shape[:-1], np.float32)
-    options: dict[str, Any] = {"background": known, "level_known": level_known, "device": "cpu"}
+    options: dict[str, Any] = {"level_known": level_known, "device": "cpu"}
     half = np.flatnonzero(response >= 0.5 * np.max(response))
     width = (half[-1] - half[0] + 1) * (1.0 - 1e-9)  # bins, and not one more by rounding
     options["irf"] = InstrumentResponse(sigma=width * 1e-12 / FWHM_PER_SIGMA)
-    for cube, out in zip(frames, significance, strict=True):
-        arrival_time(summed(cube.astype(np.int64)), gate_start=0.0, bin_width=1e-12, significance=out, **options)
+    for top in range(0, height, _ROWS):
+        first, stop = max(0, top - side // 2), top + _ROWS + side // 2
+        inner = slice(top - first, top - first + _ROWS)
+        options["background"] = np.maximum(summed(known[first:stop].astype(np.float64))[inner], 0.0)
+        for cube, image in zip(frames, significance, strict=True):
+            some, out = summed(cube[first:stop].astype(np.int64))[inner], image[top : top + _ROWS]
+            arrival_time(some, gate_start=0.0, bin_width=1e-12, significance=out, **options)
     significance = significance.reshape(found.depth.shape)
     depth = np.where(significance >= least, found.depth, np.float32(np.nan))
     probability = np.where(significance >= least, found.target_probability, np.float32(0.0))
@@ -233,34 +233,61 @@ def estimate_histograms(
     gate: tuple[float, float],
     model: str,
     to_depth: Callable[[NDArray[np.float32]], NDArray[Any]],
-    profile: ArrayLike | None,
     weights: str | Path | None,
     device: str | None,
 ) -> Estimate:
-    """`estimate` for the methods that use counts, in the bins that hold the target; `gate` and `profile` are theirs."""
-    height, width = counts.shape[-3:-1]
-    if model not in CLASSICAL and min(height, width) < SMALLEST_SIDE:
-        least = f"at least {SMALLEST_SIDE} x {SMALLEST_SIDE} are needed"
-        raise ArgumentError(f"counts are of {height} x {width} pixels; by {model!r} {least}")
-    some = counts[..., bins]
+    """`estimate` for the methods that use counts, in the bins that hold the target; `gate` is theirs."""
     given: dict[str, Any] = {"background": background[..., bins], "response": response, "device": device}
 
     def within_bins(found: Estimate) -> Estimate:
         """In a bin wider than the response the histograms tell no place: that of the pixel's own light counts."""
         if np.max(response) < _COARSE * np.sum(response):
             return found
-        near = np.abs(depth - found.depth) < (gate[1] - gate[0]) / some.shape[-1]
+        near = np.abs(depth - found.depth) < (gate[1] - gate[0]) / (bins.stop - bins.start)
         return found._replace(depth=np.where(near, depth, found.depth).astype(np.float32))
 
     if model in CLASSICAL:
-        place = to_depth(classical_depth(some, method=model, **given)).astype(np.float32)  # type: ignore[arg-type]
-        return within_bins(Estimate(place.reshape(depth.shape), np.ones_like(depth), np.full_like(depth, np.nan)))
-    features = features_of_histograms(some, **given, total=counts.sum(axis=-1), to_depth=to_depth)
-    with warnings.catch_warnings():
-        if some.shape[-1] < counts.shape[-1]:
-            warnings.simplefilter("ignore")  # depths outside this part are false peaks
-        frames = depth_frames(depth, gate=gate, profile=profile, features=features)
-    return within_bins(estimate_frames(frames, model=model, weights=weights, device=device))
+        place = classical_depth(counts[..., bins], method=model, **given)  # type: ignore[arg-type]
+        found = np.stack([place, np.ones_like(place), np.full_like(place, np.nan)])
+    else:
+        found = _by_network(counts[..., bins], weights=weights, **given)
+        empty = ~((depth > 0) & np.isfinite(depth)).reshape(found.shape[1:]).any(axis=(1, 2))
+        found[0, empty], found[1, empty] = np.nan, 0.0
+    found[0] = to_depth(found[0])
+    return within_bins(Estimate(*(image.reshape(depth.shape) for image in found)))
+
+
+_MOST_BINS = 512  # finer histograms are rebinned
+_TILE, _MARGIN = 128, 32  # pixels of a large frame that are computed at once, and those around them that are seen
+
+
+def _by_network(
+    counts: NDArray[Any], *, background: NDArray[Any], response: NDArray[Any], weights: Any, device: str | None
+) -> NDArray[np.float32]:
+    """Depth over the gate, target probability and confidence, `[3, N, H, W]`."""
+    torch = require_torch()
+    from spadwarp.denoise.histogram_network import answer, rebinned
+
+    bins, answers = counts.shape[-1], []
+    network = load_network("histograms", weights, str(torch_device(device)))
+    with torch.inference_mode():
+        for cube, level, taps in histogram_tensors(counts, background, response, device):
+            if (merged := -(-bins // _MOST_BINS)) > 1:
+                cube, level, taps = rebinned(cube, level, taps, merged)
+            height, width = cube.shape[1:3]
+            found = torch.empty(3, height, width)
+            for top, left in ((y, x) for y in range(0, height, _TILE) for x in range(0, width, _TILE)):
+                first = max(0, top - _MARGIN), max(0, left - _MARGIN)
+                part = (slice(None), *(slice(one, one + _TILE + 2 * _MARGIN) for one in first))
+                own = level[part] if level.shape[1] > 1 else level
+                probability, target = network(cube[part], own, taps)
+                tile = torch.stack([*answer(probability), target.sigmoid()])[:, 0].cpu()
+                rows, columns = (slice(at - one, at - one + _TILE) for at, one in zip((top, left), first, strict=True))
+                found[:, top : top + _TILE, left : left + _TILE] = tile[:, rows, columns]
+            found[0] *= merged * cube.shape[-1] / bins  # the last of merged bins may reach beyond the gate
+            answers.append(found)
+    depth, confidence, target = torch.stack(answers, dim=1).numpy()
+    return np.stack([depth, target, confidence])
 
 
 def _leaves_frames_empty(depth: NDArray[Any], gate: tuple[float, float], part: tuple[float, float]) -> bool:
@@ -305,7 +332,7 @@ def estimate_frames(
         check_choice("model", model, METHODS)
     if precision is not None:
         check_choice("precision", precision, get_args(Precision))
-    if model in CLASSICAL or (model == "histograms" and frames.features is None):
+    if model in ("histograms", *CLASSICAL):
         raise ArgumentError(f"model = {model!r} needs counts with their background and response; they are missing")
     if model in BASELINES:
         return _baseline(frames, model, window, weights)
@@ -317,7 +344,7 @@ def estimate_frames(
     network = load_network(model, weights, str(place), kind)
     inputs = None
     if model != "pyramid":
-        inputs = frames.network_input(histograms=model == "histograms", fills=model in ("dncnn", "usdn"))
+        inputs = frames.network_input()
     begin, extent = frames.gate[0], frames.gate[1] - frames.gate[0]
     part = max(1, _PIXELS_AT_ONCE[place.type] // frames.depth[0].size)
     # glibc returns memory to the system after each frame, and fresh pages take as long as half the network, unless a

@@ -20,7 +20,7 @@ Precision = Literal["float16", "bfloat16", "float32"]
 """Of numbers in the layers of a network."""
 
 MODELS = ("pyramid", "histograms", "dncnn", "usdn")
-"""Names of the networks; "histograms" is PyramidNet for frames whose histograms are known."""
+"""Names of the networks; "histograms" is for frames whose histograms are known."""
 
 WEIGHTS = Path(__file__).parent / "weights"
 """Folder of the package's weights."""
@@ -60,7 +60,9 @@ def load_network(
             raise ValueError(f"{wrong[0]} is not finite")
     except Exception as error:  # safetensors and torch have errors of their own
         raise FileError(f"{path}: not weights of {model!r}: {error}") from error
-    network = network.to(torch.device(device), getattr(torch, precision)).to(memory_format=torch.channels_last)
+    network = network.to(torch.device(device), getattr(torch, precision))
+    if model != "histograms":
+        network = network.to(memory_format=torch.channels_last)
     return network.eval().requires_grad_(False)
 
 

@@ -2,15 +2,15 @@
 
 All take `[batch, 3, height, width]`: depth over the gate (0 at its start, 1 at its end; 1 where nothing was reported),
 1 where the pixel reported something, and the logarithm of the backscatter's density at the reported depth (0 for a flat
-profile, see `spadwarp.denoise.synthetic_noise.log_density`). PyramidNet for histograms also takes the channels of
-`spadwarp.denoise.histogram_features`, with 0.5 subtracted from the depths among them. They return denoised depth over
-the gate, `[batch, 1, height, width]`; PyramidNet also three logits. Lengths in depth are in gate widths.
+profile, see `spadwarp.denoise.synthetic_noise.log_density`). They return denoised depth over the gate,
+`[batch, 1, height, width]`; PyramidNet also three logits. Lengths in depth are in gate widths. The network for
+histograms is in `spadwarp.denoise.histogram_network`.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable
-from functools import lru_cache, partial
+from functools import lru_cache
 from itertools import pairwise
 from typing import NamedTuple
 
@@ -19,16 +19,9 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
-from spadwarp.denoise.frames import POOLED, SCORED, SIDES
-from spadwarp.denoise.histogram_features import LIGHT, SEEN
-from spadwarp.denoise.layers import GROUP, SymmetricConv, SymmetricWindow, edge_padded, enlarged, symmetric_mean, turned
+from spadwarp.denoise.histogram_network import HistogramNet, filled_up
+from spadwarp.denoise.layers import GROUP, SymmetricConv, SymmetricWindow, edge_padded, enlarged, turned
 from spadwarp.values import ArgumentError
-
-ANSWERS = 1 + POOLED + SIDES
-"""Candidates of `Context`: the answer before, the depths among the features, and those of both sides."""
-
-CLOSE = 0.01
-"""Two depths this near belong to one return, and a depth this near to the truth is right."""
 
 
 class USDN(nn.Module):
@@ -164,24 +157,6 @@ def _directions() -> tuple[tuple[int, int], ...]:
     return tuple(places)
 
 
-# The last choice of the network for histograms: its answer, or another depth that the photons make more probable.
-
-_SPREAD = 0.004  # candidates this near to the one chosen count, too
-
-
-def selected(candidates: Tensor, scores: Tensor, spread: float | Tensor = _SPREAD) -> Tensor:
-    """The candidate with the highest score, and what is near to it, `[B, 1, H, W]`; never the mean of two surfaces."""
-    weight = torch.softmax(scores, dim=1)
-    best = candidates.gather(1, weight.argmax(dim=1, keepdim=True))
-    weight = weight * torch.exp(-((candidates - best) / spread).square())
-    return (weight * candidates).sum(dim=1, keepdim=True) / weight.sum(dim=1, keepdim=True)
-
-
-_SEEN = ANSWERS + 2 + (SEEN - POOLED) + POOLED + SIDES * (1 + SCORED) + 3 + 3 + 2
-_LEAST_WAY = 0.01  # added to the way between both sides
-_SURE = 12.0  # from such a highest log-likelihood of a pixel on, its answer is one surface [nats]
-
-
 class _Residual(nn.Module):
     def __init__(self, features: int) -> None:
         super().__init__()
@@ -192,101 +167,6 @@ class _Residual(nn.Module):
     def forward(self, x: Tensor) -> Tensor:
         return self.second(F.relu(self.first(F.relu(x)), inplace=True)).add_(x)
 
-
-class Context(nn.Module):
-    """Weights of `ANSWERS` depths for every pixel. With new weights the answer before keeps nearly all of it.
-
-    Where photons are few, nearly all of the squared error comes from pixels beside edges of depth. Which surface such a
-    pixel sees, the pixel and its nearest neighbours do not tell; the course of the edge does, and that of the counts.
-    So depths are written as parts of the way from the nearer to the farther surface around each pixel, with the
-    log-likelihoods of all, and a pyramid of features weighs them.
-    """
-
-    def __init__(self) -> None:
-        super().__init__()
-        widths, hidden = (8, 12, 16, 24), 64
-        self.pixel = nn.Sequential(nn.Conv2d(_SEEN, hidden, 1), nn.ReLU(), nn.Conv2d(hidden, hidden, 1), nn.ReLU())
-        self.light = nn.Conv2d(LIGHT, hidden, 1, bias=False)
-        self.enter = SymmetricConv(hidden, widths[0], 3, lifts=True)
-        pairs = list(pairwise(widths))
-        self.first = _Residual(widths[0])
-        self.down = nn.ModuleList(SymmetricConv(wide, narrow, 4, stride=2) for wide, narrow in pairs)
-        self.before = nn.ModuleList(_Residual(width) for width in widths[1:])
-        self.deep = _Residual(widths[-1])
-        self.up = nn.ModuleList(SymmetricConv(narrow, wide, 1, bias=False) for wide, narrow in pairs)
-        self.after = nn.ModuleList(_Residual(width) for width in widths[:-1])
-        self.last = SymmetricConv(widths[0], 8, 1)
-        self.head = nn.Sequential(nn.Conv2d(16 + hidden, hidden, 1), nn.ReLU(), nn.Conv2d(hidden, ANSWERS, 1))
-        self.target = nn.Sequential(nn.Conv2d(16 + hidden, hidden, 1), nn.ReLU(), nn.Conv2d(hidden, 1, 1))
-        self.stride = 2 ** len(pairs)
-        final, target = self.head[-1], self.target[-1]
-        with torch.no_grad():
-            for one in (self.light.weight, target.weight, target.bias):
-                one.zero_()  # type: ignore[operator]
-            final.weight.mul_(0.1)  # type: ignore[operator]
-            final.bias.zero_()  # type: ignore[operator]
-            final.bias[0] = 3.0  # type: ignore[index, operator]
-
-    def forward(self, found: Tensor, logits: Tensor, features: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-        """Depths and their scores, each `[B, ANSWERS, H, W]`; what is added to the target's logit.
-
-        Of the answer before `[B, 1, H, W]`, the network's three logits and the features.
-        """
-        depths, *images = _seen(found, logits, features)
-        height, width = found.shape[-2:]
-        seen, light = (_filled_up(image, self.stride) for image in images)
-        pixel = self.pixel[1:](self.pixel[0](seen) + self.light(light))
-        x = self.first(self.enter(pixel))
-        skipped = []
-        for down, before in zip(self.down, self.before, strict=True):
-            skipped.append(x)
-            x = before(down(F.relu(x)))
-        x = self.deep(x)
-        for up, after, skip in reversed(list(zip(self.up, self.after, skipped, strict=True))):
-            x = after(skip + enlarged(up(x), 2))
-        x = F.relu(self.last(F.relu(x))).unflatten(1, (-1, GROUP))
-        x = torch.cat([x.mean(dim=2), x.amax(dim=2), pixel], dim=1)
-        scores, target = (head(x).float()[..., :height, :width] for head in (self.head, self.target))
-        return depths, scores, target
-
-
-def answer(depths: Tensor, scores: Tensor, features: Tensor) -> Tensor:
-    """Mean of the depths where photons are few; else the one with the highest score, `[B, 1, H, W]`."""
-    peak = 10.0 * features[:, POOLED + SCORED * POOLED :][:, :1]
-    return selected(depths, scores, _SPREAD + torch.sigmoid(_SURE - peak))
-
-
-def _seen(found: Tensor, logits: Tensor, features: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-    """Candidates, and what the layers see; the last part of it apart."""
-    rest, own = features[:, POOLED:SEEN], features[:, SEEN : SEEN + POOLED]
-    beside, light, sides = features[:, SEEN + POOLED :].tensor_split([-SIDES - LIGHT, -SIDES], dim=1)
-    depths = torch.cat([found, 0.5 + features[:, :POOLED], sides], dim=1)
-    front, back = sides[:, 2:3], sides[:, 3:4]
-    parts = ((depths - front) / (back - front + _LEAST_WAY)).clamp(-1.0, 2.0)
-    steps = 0.3 * torch.log(torch.cat([back - front, sides[:, 1:2] - sides[:, :1]], dim=1).clamp_min(0.0) + 0.003) + 1.0
-    scores = torch.cat([torch.asinh(own), torch.asinh(beside[:, :SIDES]), beside[:, SIDES:]], dim=1)
-    places = 2.0 * torch.cat([found, front, back], dim=1) - 1.0
-    peak = rest[:, SCORED * POOLED : SCORED * POOLED + 2]
-    level = peak.mean(dim=(2, 3), keepdim=True).expand_as(peak)
-    return depths, torch.cat([parts, steps, rest, scores, 0.25 * logits, places, level], dim=1), light
-
-
-def _filled_up(image: Tensor, stride: int) -> Tensor:
-    """With rows and columns that mirror those before the last, up to multiples of `stride`.
-
-    Copies of the last one would agree in depth, as those of a target do.
-    """
-    for axis in (-2, -1):
-        length = image.shape[axis]
-        if length % stride:
-            period = max(1, 2 * length - 2)
-            place = torch.arange(length + -length % stride, device=image.device) % period
-            image = image.index_select(axis, torch.minimum(place, period - place))
-    return image
-
-
-LONGEST_DELAY = 0.2
-"""Largest delay of forward-scattered light that the network can correct."""
 
 _WIDEST = 0.1  # depths this far from the first answer still count for the second
 _NEAR = 5  # side of the window whose depths are taken as they are
@@ -305,26 +185,17 @@ class PyramidNet(nn.Module):
 
     The output, `[batch, 4, height, width]`: depth over the gate; the logits of "the pixel sees a target", of "the depth
     is right to `CLOSE`", and of "the reported depth is the target's".
-
-    With `histograms` it sees the channels of `spadwarp.denoise.histogram_features`, not the votes. Each pixel then
-    first gets a depth from the candidates among them, which replaces the reported one in all that follows: the most
-    probable one, never the mean of two returns. The delay of scattered light, which the shape of the return shows, is
-    subtracted from the result. Last, `Context` weighs the answer and the candidates with a view of what is around. A
-    fifth output is the depth of the candidates, and one for each candidate its logit. While it learns, there are also
-    the depths of `Context` and their scores, its answer and its logit of "sees a target"; depth and logits are those
-    before it.
     """
 
     stride = 16  # sizes are filled up to multiples of it
 
-    def __init__(self, *, histograms: bool = False) -> None:
+    def __init__(self) -> None:
         super().__init__()
-        self.histograms = histograms
-        votes, last = not histograms, 8
-        widths = (4, 5, 8, 10, 12 if histograms else 14)  # features of the levels
+        last = 8
+        widths = (4, 5, 8, 10, 14)  # features of the levels
         pairs, deep = list(pairwise(widths)), len(widths) - 1
-        self.enter = SymmetricConv(6 + _SCALARS * votes, widths[0], 3, lifts=True)
-        self.enter_agreement = SymmetricConv(2, widths[0], 3, bias=False) if votes else None
+        self.enter = SymmetricConv(6 + _SCALARS, widths[0], 3, lifts=True)
+        self.enter_agreement = SymmetricConv(2, widths[0], 3, bias=False)
         self.down = nn.ModuleList(SymmetricConv(wide, narrow, 4, stride=2) for wide, narrow in pairs)
         self.up = nn.ModuleList(SymmetricConv(narrow, wide, 1, bias=False) for wide, narrow in pairs)
         self.before = nn.ModuleList(
@@ -333,12 +204,12 @@ class PyramidNet(nn.Module):
         )
         self.after = nn.ModuleList(_Residual(width) for width in widths[1:-1])
         self.finish = SymmetricConv(widths[0], widths[0], 3)
-        self.polish = nn.ModuleList(_Residual(widths[0]) for _ in range(votes))
+        self.polish = nn.ModuleList([_Residual(widths[0])])
         self.spread = SymmetricConv(widths[0], last, 1)
         self.near = SymmetricWindow(last, _NEAR)
         self.wide = nn.ModuleList(SymmetricWindow(last, 3) for _ in _BOXES)
         # Weight and value of the network's own depth; logits; reach of refining; weight of the depth voted for.
-        self.scalars = nn.Conv2d(last, 5 + 2 * votes, 1)
+        self.scalars = nn.Conv2d(last, 7, 1)
         with torch.no_grad():  # begins near the identity
             assert self.scalars.bias is not None
             self.near.bias[0] = 3.0  # of the pixel itself
@@ -347,44 +218,26 @@ class PyramidNet(nn.Module):
                     if bias.ndim == 1:
                         bias.fill_(-2.0)
             self.scalars.weight.mul_(0.3)
-            self.scalars.bias.copy_(torch.tensor([-2.0, 0.0, 2.0, 0.0, 2.0, *[-1.0, 3.0] * votes]))
-            if self.enter_agreement is not None:
-                # Begins with the depth voted for, and with features that count little: noise in the weights would at
-                # first teach the features to vanish, after which they learn no more.
-                for layer in (self.scalars, self.near, *self.wide):
-                    layer.weight.mul_(0.1)
-                for layer in (self.enter_agreement, *self.up):
-                    layer.weight.mul_(0.3)
-                self.enter.weight[:, -_SCALARS:].mul_(0.3)
-        if histograms:
-            self.enter_features = SymmetricConv(SEEN, widths[0], 3, lifts=True, bias=False)
-            self.choose = nn.Conv2d(last, 1 + POOLED + 1, 1)  # logits of the reported depth and the candidates; delay
-            self.evidence = nn.Parameter(torch.tensor([0.5, 0.2, 0.1, 0.3]))  # weights of scores in these logits
-            self.context = Context()
-            with torch.no_grad():
-                assert self.choose.bias is not None
-                self.enter_features.weight.mul_(0.3)
-                self.choose.weight.mul_(0.3)
-                self.choose.bias.zero_()
-                self.choose.bias[-1] = -5.0
+            self.scalars.bias.copy_(torch.tensor([-2.0, 0.0, 2.0, 0.0, 2.0, -1.0, 3.0]))
+            # Begins with the depth voted for, and with features that count little: noise in the weights would at first
+            # teach the features to vanish, after which they learn no more.
+            for layer in (self.scalars, self.near, *self.wide):
+                layer.weight.mul_(0.1)
+            for layer in (self.enter_agreement, *self.up):
+                layer.weight.mul_(0.3)
+            self.enter.weight[:, -_SCALARS:].mul_(0.3)
 
     def forward(self, frame: Tensor) -> Tensor:
         """See the class; `frame` as the head of this file describes it."""
         height, width = frame.shape[-2:]
-        frame = _filled_up(frame, self.stride)
-        depth, reported, features = frame[:, :1].float(), frame[:, 1:2].float(), frame[:, 3:].float()
-        votes = None if self.histograms else neighbour_votes(depth, reported)
+        frame = filled_up(frame, self.stride)
+        depth, reported = frame[:, :1].float(), frame[:, 1:2].float()
+        votes = neighbour_votes(depth, reported)
         x = self._features(frame, votes)
-        delay: Tensor | None = None
-        extra: list[Tensor] = []
-        if self.histograms:
-            depth, delay, extra = self._chosen(depth, features, x)
-            reported = torch.ones_like(depth)
         weights, own, others, reach = self._heads(x)
         values, trusts = _candidates(depth, reported, others[:, 2:])
-        values, trusts = [*values, 0.5 + own], [*trusts, torch.zeros_like(depth)]
-        if votes is not None:
-            values, trusts = [*values, votes.depth], [*trusts, 1e4 * (votes.support > 0.0) - 1e4]
+        values = [*values, 0.5 + own, votes.depth]
+        trusts = [*trusts, torch.zeros_like(depth), 1e4 * (votes.support > 0.0) - 1e4]
         parts = weights, torch.cat(trusts, dim=1), torch.cat(values, dim=1), reach
         if torch.is_grad_enabled():
             found = _answer(*parts)
@@ -393,36 +246,15 @@ class PyramidNet(nn.Module):
         else:  # strips of a few rows stay in a CPU's cache
             strips = zip(*(part.split(8, 2) for part in parts), strict=True)
             found = torch.cat([_answer_in_place(*strip) for strip in strips], 2)
-        if delay is not None:
-            before, logits = found.detach(), others.detach()  # what comes after learns from its own answer alone
-            if torch.is_grad_enabled():
-                extra += self._learnt(before, logits, features, delay.detach())
-            else:
-                depths, scores, target = self.context(before, logits, features)
-                found = answer(depths, scores, features)
-                others = torch.cat([others[:, :1] + target, others[:, 1:]], dim=1)
-            found = found - delay
-        return torch.cat([found, others, *extra], dim=1)[..., :height, :width]
+        return torch.cat([found, others], dim=1)[..., :height, :width]
 
-    def _learnt(self, found: Tensor, logits: Tensor, features: Tensor, delay: Tensor) -> list[Tensor]:
-        """Depths of the wide view and their scores, its answer and its logit "target"."""
-        depths, weights, target = self.context(found, logits, features)
-        last = answer(depths, weights, features)
-        return [depths - delay, weights, last - delay, logits[:, :1] + target]
-
-    def _features(self, frame: Tensor, votes: Votes | None) -> Tensor:
+    def _features(self, frame: Tensor, votes: Votes) -> Tensor:
         """Features of every pixel, after a ReLU, `[B, 64, H, W]`."""
         depth, reported, density = (channel.contiguous() for channel in frame[:, :3].split(1, dim=1))
         ranked = [rank - depth for rank in ranks(depth)]
         scalars = [(depth - 0.5) * reported, reported, 0.25 * density, *ranked]
-        if votes is not None:
-            scalars += [votes.near, votes.wide, votes.depth - depth, votes.support]
-        entering = [(self.enter, torch.cat(scalars, dim=1))]
-        if votes is not None and self.enter_agreement is not None:
-            entering.append((self.enter_agreement, votes.agreement))
-        if self.histograms:
-            entering.append((self.enter_features, frame[:, 3 : 3 + SEEN]))
-        x = self._entered(entering)
+        scalars += [votes.near, votes.wide, votes.depth - depth, votes.support]
+        x = self._entered([(self.enter, torch.cat(scalars, dim=1)), (self.enter_agreement, votes.agreement)])
         skipped = []
         for down, before in zip(self.down, self.before, strict=True):
             skipped.append(x)
@@ -453,10 +285,10 @@ class PyramidNet(nn.Module):
 
         The layers that these come from are applied as one.
         """
-        layers, votes = [window.filters() for window in (self.near, *self.wide)], not self.histograms
+        layers = [window.filters() for window in (self.near, *self.wide)]
         # Weights of the own depth and of the one voted for; then what is no weight. Slices, not a list of rows, which
         # would have to be copied to the GPU.
-        order = [slice(0, 1), *[slice(-1, None)] * votes, slice(1, 5), *[slice(5, 6)] * votes]
+        order = [slice(0, 1), slice(-1, None), slice(1, 5), slice(5, 6)]
         assert self.scalars.bias is not None
         for rows in order:
             weight = self.scalars.weight[rows, :, 0, 0].repeat_interleave(GROUP, 1) / GROUP
@@ -466,33 +298,21 @@ class PyramidNet(nn.Module):
         pixels = x.permute(0, 2, 3, 1).flatten(1, 2).transpose(1, 2)
         found = torch.baddbmm(biases[:, None], filters.expand(len(x), -1, -1), pixels).float()
         found = found.unflatten(2, x.shape[2:])
-        weights, own, logits, reach = found.split([found.shape[1] - 4 - votes, 1, 3, int(votes)], dim=1)
+        weights, own, logits, reach = found.split([found.shape[1] - 5, 1, 3, 1], dim=1)
         return weights, own, logits, reach
-
-    def _chosen(self, depth: Tensor, features: Tensor, x: Tensor) -> tuple[Tensor, Tensor, list[Tensor]]:
-        """A depth for each pixel, the delay of its light; and that depth and the candidates' logits as outputs."""
-        candidates = torch.cat([depth, 0.5 + features[:, :POOLED]], dim=1)
-        scores = features[:, POOLED : POOLED + SCORED * POOLED].unflatten(1, (SCORED, POOLED))
-        scores = torch.cat([scores[:, :, :1], scores], dim=2)  # the reported depth has those of the own return
-        head = self.choose(symmetric_mean(x)).float()
-        logits = head[:, :-1] + 10.0 * (scores * self.evidence[:, None, None, None]).sum(dim=1)
-        chosen = selected(candidates, logits, CLOSE)
-        return chosen, LONGEST_DELAY * torch.sigmoid(head[:, -1:]), [chosen, logits]
 
 
 def _answer(weights: Tensor, trusts: Tensor, values: Tensor, reach: Tensor) -> Tensor:
-    """Weighted mean of the values, then, where `reach` has a channel, one in which those far from it count less.
+    """Weighted mean of the values, then one in which those far from it count less.
 
     What comes from another surface keeps little part in the answer. The fall with distance is a power, not an
     exponential: a depth that is not trusted stays so where it is near. At `_WIDEST` sigmoid(reach) it is a quarter.
     """
     weight = torch.softmax(weights + trusts, dim=1)
     found = (weight * values).sum(dim=1, keepdim=True)
-    if reach.shape[1]:
-        near = (values - found) * (1.0 / (0.002 + _WIDEST * torch.sigmoid(reach)))
-        near = weight / torch.addcmul(torch.ones_like(reach), near, near).square()
-        found = (near * values).sum(dim=1, keepdim=True) / (near.sum(dim=1, keepdim=True) + 1e-12)
-    return found
+    near = (values - found) * (1.0 / (0.002 + _WIDEST * torch.sigmoid(reach)))
+    near = weight / torch.addcmul(torch.ones_like(reach), near, near).square()
+    return (near * values).sum(dim=1, keepdim=True) / (near.sum(dim=1, keepdim=True) + 1e-12)
 
 
 def _answer_in_place(weights: Tensor, trusts: Tensor, values: Tensor, reach: Tensor) -> Tensor:
@@ -501,12 +321,10 @@ def _answer_in_place(weights: Tensor, trusts: Tensor, values: Tensor, reach: Ten
     weight.sub_(weight.amax(dim=1, keepdim=True)).exp_()
     part = weight * values
     found = part.sum(dim=1, keepdim=True).div_(weight.sum(dim=1, keepdim=True))
-    if reach.shape[1]:
-        near = torch.sub(values, found, out=part).mul_(reach.sigmoid().mul_(_WIDEST).add_(0.002).reciprocal_())
-        weight.div_(near.square_().add_(1.0).square_())
-        found = torch.mul(weight, values, out=part).sum(dim=1, keepdim=True)
-        found.div_(weight.sum(dim=1, keepdim=True).add_(1e-12))
-    return found
+    near = torch.sub(values, found, out=part).mul_(reach.sigmoid().mul_(_WIDEST).add_(0.002).reciprocal_())
+    weight.div_(near.square_().add_(1.0).square_())
+    found = torch.mul(weight, values, out=part).sum(dim=1, keepdim=True)
+    return found.div_(weight.sum(dim=1, keepdim=True).add_(1e-12))
 
 
 def _candidates(depth: Tensor, reported: Tensor, true: Tensor) -> tuple[list[Tensor], list[Tensor]]:
@@ -564,7 +382,7 @@ NETWORKS: dict[str, Callable[[], nn.Module]] = {
     "usdn": USDN,
     "dncnn": DnCNN,
     "pyramid": PyramidNet,
-    "histograms": partial(PyramidNet, histograms=True),
+    "histograms": HistogramNet,
 }
 """Networks by the name that recipes and commands use."""
 
@@ -574,8 +392,3 @@ def build_network(name: str) -> nn.Module:
     if name not in NETWORKS:
         raise ArgumentError(f"model = {name!r} is not one of {', '.join(map(repr, NETWORKS))}")
     return NETWORKS[name]()
-
-
-def reads_histograms(network: nn.Module) -> bool:
-    """Whether this network needs the channels of `spadwarp.denoise.histogram_features`."""
-    return getattr(network, "histograms", False)

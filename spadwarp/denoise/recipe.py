@@ -79,7 +79,7 @@ class Noise(Section):
         0.0, description="of these, samples with a background, and with a response, that are not known well"
     )
     resampled: Share = Field(
-        0.0, description="samples whose depth was resampled, so that pixels at edges lie between both surfaces"
+        0.0, description="samples whose depth is the mean over each pixel: at edges it lies between both surfaces"
     )
     sparse: Share = Field(0.25, description="samples in which only 3 to 100 % of the pixels report anything")
     tail: Share = Field(0.15, description="samples whose jitter has a late tail, as avalanche photodiodes have")
@@ -119,10 +119,6 @@ class Optimiser(Section):
         description='"psnr": logarithm of the mean square of each crop, so that easy crops count as much as hard ones',
     )
     precision: Literal["bfloat16", "float32"] = Field("bfloat16", description="of the network's layers on a GPU")
-    pool: Whole = Field(
-        0, ge=0, le=10**7, description="samples at hand, of which each update takes some; 0: each update draws its own"
-    )
-    uses: float = Field(1.0, ge=1, le=1e6, description="updates that a sample of the pool is used in, on average")
     report_every: Whole | None = Field(
         None, ge=1, le=10**12, description="updates between two lines of the log; default: steps / 20, at most 500"
     )
@@ -145,7 +141,7 @@ class TrainingRecipe(Document):
     )
     seed: Whole = Field(0, ge=0, le=2**63 - 1, description="of weights, crops and noise")
     noise: Noise = Noise()
-    mixture: tuple[Part, ...] = Field((), description="parts of the samples with other noise; needs a pool")
+    mixture: tuple[Part, ...] = Field((), description="parts of the samples of histograms with other noise")
     optimiser: Optimiser = Optimiser()
 
     @pydantic.model_validator(mode="before")
@@ -165,10 +161,8 @@ class TrainingRecipe(Document):
         for noise in (self.noise, *self.mixture):
             if reads_histograms and noise.counting != 1:
                 raise ValueError(f'noise.counting = {noise.counting} with model = "histograms", which needs 1')
-        if self.mixture and not self.optimiser.pool:
-            raise ValueError("optimiser.pool = 0 with a mixture, whose parts need a pool")
-        if self.optimiser.pool and not reads_histograms:
-            raise ValueError(f"optimiser.pool = {self.optimiser.pool} with model = {self.model!r}, which has none")
+        if self.mixture and not reads_histograms:
+            raise ValueError(f"mixture with model = {self.model!r}, which has none")
         total = sum(part.share for part in self.mixture)
         if self.mixture and abs(total - 1.0) > 1e-6:
             raise ValueError(f"mixture: the shares add up to {total:g}, not to 1")

@@ -20,8 +20,8 @@ import torch.nn.functional as F
 from torch import Tensor
 
 from spadwarp.denoise.classical import highest
-from spadwarp.denoise.frames import LOG_DENSITY_LIMIT, MARGIN, POOLED
-from spadwarp.denoise.histogram_features import extract_features, toeplitz
+from spadwarp.denoise.frames import LOG_DENSITY_LIMIT, MARGIN
+from spadwarp.denoise.histogram_network import toeplitz
 from spadwarp.denoise.recipe import Noise
 
 _THINGS = 10  # at most, in a scene
@@ -54,15 +54,22 @@ class Random:
         return torch.randint(stop, (self.size, *shape), generator=self.generator, device=self.generator.device)
 
 
-def draw_scenes(count: int, side: int, generator: torch.Generator) -> tuple[Tensor, Tensor, Tensor]:
-    """Depth and its deviation `[S, side, side]`, NaN where there is only water, and gates around it `[S, 2]` [m]."""
+def draw_scenes(count: int, side: int, generator: torch.Generator, *, finer: int = 1) -> tuple[Tensor, Tensor, Tensor]:
+    """Depth and its deviation `[S, side, side]`, NaN where there is only water, and gates around it `[S, 2]` [m].
+
+    With `finer` they are of so many rows and columns of subpixels in each pixel, in part from farther away, and steep
+    surfaces are darker.
+    """
     random = Random(count, generator)
     relief = random.log_between((0.08, 2.5), 1, 1)  # of the whole scene [m]
-    depth = _background(side, random)
+    depth = _background(side, random, finer)
     together = random.coin(0.35)  # things that are parts of one body
     centre, place = 0.3 * side * (2 * random.uniform(2) - 1), random.between((0.15, 0.85))
     paint = 0.5 * random.normal(torch.Size((count, 1, 1))) * torch.ones_like(depth)  # ln of reflectance, negative
     number = torch.where(random.coin(0.15), 0, 1 + random.integer(_THINGS))
+    far = torch.ones_like(place)  # as much smaller are all things
+    if finer > 1:
+        far = torch.where(random.coin(0.4), far, random.log_between((1.0, 4.0)))
     for slot in range(_THINGS):
         apart = random.between((-0.6, 0.6), 2) * side
         at = torch.where(together[:, None], centre + 0.35 * apart, apart)
@@ -72,14 +79,18 @@ def draw_scenes(count: int, side: int, generator: torch.Generator) -> tuple[Tens
             chosen = ((kind == index) & (slot < number)).nonzero()[:, 0]
             if len(chosen):
                 part = Random(len(chosen), generator)
-                inside, surface = draw(*_turned(at[chosen], side, part), part)
+                y, x = _turned(at[chosen], side, part, finer)
+                inside, surface = draw(far[chosen, None, None] * y, far[chosen, None, None] * x, part)
                 surface = z[chosen, None, None] + surface
                 drawn = inside & (surface > -0.1) & ~(surface >= depth[chosen])
                 depth[chosen] = torch.where(drawn, surface, depth[chosen])
                 paint[chosen] = torch.where(drawn, 0.5 * part.normal(torch.Size((len(chosen), 1, 1))), paint[chosen])
     metres = 15.0 + relief * (depth - 0.5)
     grain = 0.5 * random.uniform(1, 1) * random.coin(0.3, 1, 1) * random.normal(depth.shape)  # from pixel to pixel
-    texture = torch.exp(0.5 * smooth_noise(count, side, generator) + 0.3 * _pattern(side, random) + paint + grain)
+    texture = 0.5 * smooth_noise(count, side * finer, generator) + 0.3 * _pattern(side, random, finer)
+    texture = torch.exp(texture + paint + grain)
+    if finer > 1:
+        texture *= _steepness(metres * finer / random.log_between((0.01, 0.12), 1, 1)).square().add(1.0) ** 0.25
     sigma = torch.where(torch.isfinite(metres), _JITTER * texture.clamp(0.3, 4.0), math.nan)
     low = torch.where(torch.isfinite(metres), metres, math.inf).flatten(1).amin(dim=1)
     high = torch.where(torch.isfinite(metres), metres, -math.inf).flatten(1).amax(dim=1)
@@ -100,12 +111,23 @@ def smooth_noise(count: int, side: int, generator: torch.Generator) -> Tensor:
     return total[:, 0]
 
 
-def _background(side: int, random: Random) -> Tensor:
+def _steepness(depth: Tensor) -> Tensor:
+    """Slope of a map `[S, h, w]` from one to the next, on the side where it is less; 0 beside open water."""
+    total = torch.zeros_like(depth)
+    for axis in (1, 2):
+        step = depth.diff(dim=axis).abs()
+        ends = step.narrow(axis, 0, 1), step.narrow(axis, -1, 1)
+        before, after = torch.cat([ends[0], step], axis), torch.cat([step, ends[1]], axis)
+        total += torch.fmin(before, after).nan_to_num(0.0).square()
+    return total.sqrt()
+
+
+def _background(side: int, random: Random, finer: int) -> Tensor:
     """Relative depth of what is behind: NaN (water), a wall about 1, or a floor that comes near at one side."""
     count, device = random.size, random.generator.device
-    y, x = _turned(torch.zeros(count, 2, device=device), side, random)
+    y, x = _turned(torch.zeros(count, 2, device=device), side, random, finer)
     kind = random.uniform()[:, None, None]
-    rough = 0.15 * random.uniform(1, 1) * random.coin(0.6, 1, 1) * smooth_noise(count, side, random.generator)
+    rough = 0.15 * random.uniform(1, 1) * random.coin(0.6, 1, 1) * smooth_noise(count, side * finer, random.generator)
     slope = 0.6 * (2 * random.uniform(1, 1) - 1) * random.coin(0.7, 1, 1)
     wall = 1.0 + slope * x / side + rough
     nearest, horizon = random.between((0.0, 0.7), 1, 1), random.between((-0.6, 0.5), 1, 1)
@@ -115,9 +137,9 @@ def _background(side: int, random: Random) -> Tensor:
     return torch.where(kind < 0.42, torch.full_like(wall, math.nan), torch.where(kind < 0.75, wall, floor))
 
 
-def _turned(at: Tensor, side: int, random: Random) -> tuple[Tensor, Tensor]:
+def _turned(at: Tensor, side: int, random: Random, finer: int) -> tuple[Tensor, Tensor]:
     """Image coordinates about `at`, turned by a random angle, often a right one, `[S, side, side]` [pixels]."""
-    line = torch.arange(side, device=at.device) - 0.5 * (side - 1)
+    line = (torch.arange(side * finer, device=at.device) - 0.5 * (side * finer - 1)) / finer
     y, x = line[None, :, None] - at[:, 0, None, None], line[None, None, :] - at[:, 1, None, None]
     angle = 2 * math.pi * random.uniform(1, 1)
     right = torch.round(angle * (2 / math.pi)) * (math.pi / 2)
@@ -125,9 +147,9 @@ def _turned(at: Tensor, side: int, random: Random) -> tuple[Tensor, Tensor]:
     return y * angle.cos() + x * angle.sin(), x * angle.cos() - y * angle.sin()
 
 
-def _pattern(side: int, random: Random) -> Tensor:
+def _pattern(side: int, random: Random, finer: int) -> Tensor:
     """Stripes or squares of reflectance, ±1, or nothing, `[S, side, side]`."""
-    y, x = _turned(torch.zeros(random.size, 2, device=random.generator.device), side, random)
+    y, x = _turned(torch.zeros(random.size, 2, device=random.generator.device), side, random, finer)
     pitch = random.log_between((3.0, 40.0), 1, 1)
     stripes = torch.sign(torch.sin(x / pitch * math.pi))
     squares = stripes * torch.sign(torch.sin(y / pitch * math.pi))
@@ -276,16 +298,22 @@ KINDS = (_plate, _ellipsoid, _rod, _rope, _net, _ladder, _plant, _chain, _rock, 
 BINS = 64
 """Bins of a backscatter profile over the gate."""
 
-COUNT_BINS = (64, 96, 128, 192, 256, 320)
+COUNT_BINS = (64, 96, 128, 192, 256, 400)
 """Bins of the histograms behind frames with few photons, one number for each batch."""
 
 _RARER = 1.5  # power of a uniform number: low backscatter fractions are drawn more often than high ones
-_WRONG = (0.5, 2.0)  # factors on a background that is not known well; their roots on the width of the response
-_TAPS = 12  # a response extends over this many bins to each side
+_WRONG = (0.5, 2.0)  # factors on a background, and on the width of a response, that are not known well
+_FLOOR = 0.01  # part of the signal that may come in any bin, where a response is fitted
+_ESTIMATED = 0.03, 0.1  # deviations of height and slope, relative, of a background that is estimated from the frame
+_TAPS = 32  # a response extends over this many bins to each side
+
+
+SUBPIXELS = 3
+"""Rows and columns of subpixels in each pixel of the scenes behind histograms: a pixel sees an area, not a point."""
 
 
 class CleanScenes(NamedTuple):
-    """Clean scenes on the training device, float32."""
+    """Clean scenes on the training device, float32; H and W of pixels, or of subpixels."""
 
     depth: Tensor  # [S, H, W] [m]; NaN where nothing is hit
     sigma: Tensor  # Cramér–Rao bound of depth, [S, H, W] [m]; NaN where there is none
@@ -300,10 +328,9 @@ class CleanScenes(NamedTuple):
 class Batch(NamedTuple):
     """Noisy frames and what they are of."""
 
-    frame: Tensor  # as networks take them, [B, 3, h, w], or [B, 3 + FEATURES, h, w] with histograms
+    inputs: tuple[Tensor, ...]  # as networks take them: [B, 3, h, w]; or counts, background and response
     clean: Tensor  # depth over the gate, [B, 1, h, w]
     hit: Tensor  # where a target is seen, [B, 1, h, w]
-    judged: Tensor  # 1 where a crop counts for the target's probability, else 0, [B, 1, 1, 1]
 
 
 class _Crops(NamedTuple):
@@ -315,12 +342,14 @@ class _Crops(NamedTuple):
     reach: Tensor  # depth behind which no backscatter comes from
     profile: Tensor  # of backscatter over the camera's gate, [B, BINS]
     camera: Tensor  # start and width of that gate, which is wider, [B, 2]
+    seen: Tensor  # depth of the subpixels of each pixel, NaN where there is none, [B, n, h, w]
+    bound: Tensor  # its bound
 
 
-def procedural_scenes(count: int, side: int, *, seed: int, device: torch.device | str) -> CleanScenes:
-    """Scenes of `spadwarp.denoise.synthetic_noise`, `side` × `side` pixels, in water of flat backscatter."""
+def procedural_scenes(count: int, side: int, *, seed: int, device: torch.device | str, finer: int = 1) -> CleanScenes:
+    """Scenes of `draw_scenes`, in water of flat backscatter."""
     generator = torch.Generator(device).manual_seed(seed)
-    depth, sigma, gate = draw_scenes(count, side, generator)
+    depth, sigma, gate = draw_scenes(count, side, generator, finer=finer)
     return CleanScenes(depth, sigma, gate, torch.ones(count, BINS, device=depth.device))
 
 
@@ -334,38 +363,40 @@ def draw_batch(
     always_replaced: bool = False,
     histograms: bool = False,
     bins: int = 192,
+    finer: int = 1,
 ) -> Batch:
     """`size` pairs of `crop` × `crop` pixels, on the scenes' device, which is the generator's.
 
-    A tenth of the samples has no pixels that report backscatter, unless `always_replaced`. With `histograms`, all
-    samples are of counts and have the channels of their features.
+    A tenth of the samples has no pixels that report backscatter, unless `always_replaced`. With `histograms` they are
+    counts of so many `bins`. `finer`: of the scenes.
     """
     random = Random(size, generator)
-    crops = _draw_crops(scenes, noise, crop, random)
+    crops = _draw_crops(scenes, noise, crop, random, finer)
+    hit = crops.hit[:, None].float()
+    if histograms:
+        photons, sbr = random.log_between(noise.photons), random.log_between(noise.sbr)
+        cubes, level, response = _draw_counts(crops, photons, photons / sbr, noise, generator, bins)
+        return Batch((cubes, level[:, None, None], response), crops.clean[:, None], hit)
     reported, present = _report(crops, noise, random, always_replaced)
     counted = round(noise.counting * size)
-    features = None
     if counted:
         photons, sbr = random.log_between(noise.photons)[:counted], random.log_between(noise.sbr)[:counted]
         some = _Crops(*(values[:counted] for values in crops))
         counts = _draw_counts(some, photons, photons / sbr, noise, generator, bins)
-        reported[:counted], present[:counted], features = _estimate(*counts, photons, histograms)
+        reported[:counted], present[:counted] = _estimate(*counts, photons)
     reported, present = _defects(reported, present, noise, random)
-    clean, hit, profile = crops.clean, crops.hit, crops.profile
+    profile = crops.profile
     reported = torch.where(present, reported, 1.0)
     known = torch.where(random.coin(noise.unknown_water)[:, None], 1.0, profile)
     start, width = crops.camera[:, 0, None, None], crops.camera[:, 1, None, None]
     density = torch.where(present, log_density(known, (reported - start) / width), 0.0)
     frame = torch.stack([reported, present.float(), density], dim=1)
-    if features is not None:
-        features[:, :POOLED] -= 0.5
-        frame = torch.cat([frame, features], dim=1)
-    return Batch(frame, clean[:, None], hit[:, None].float(), torch.ones_like(frame[:, :1, :1, :1]))
+    return Batch((frame,), crops.clean[:, None], hit)
 
 
 def _report(crops: _Crops, noise: Noise, random: Random, always_replaced: bool) -> tuple[Tensor, Tensor]:
     """Reported depths over the gate, and which pixels report, `[B, h, w]`: the target's, or backscatter's."""
-    clean, sigma, hit, reach, profile, camera = crops
+    clean, sigma, hit, reach, profile, camera, _, _ = crops
     start, width = camera[:, 0, None, None], camera[:, 1, None, None]
     reported = clean + sigma * random.normal(clean.shape)
     late = (sigma * random.between((0.5, 3.0), 1, 1)) * -torch.log1p(-random.uniform(*clean.shape[1:]))
@@ -411,14 +442,16 @@ def log_density(profile: Tensor, depth: Tensor) -> Tensor:
     return profile.gather(1, place).clamp(math.exp(-limit), math.exp(limit)).log().view_as(depth)
 
 
-def _draw_crops(scenes: CleanScenes, noise: Noise, crop: int, random: Random) -> _Crops:
+def _draw_crops(scenes: CleanScenes, noise: Noise, crop: int, random: Random, finer: int) -> _Crops:
     """Crops of random scenes, each with a gate and a water."""
     index = random.integer(len(scenes.depth))
-    depth, sigma = _cut(scenes, index, crop, random)
+    seen, bound = _cut(scenes, index, crop, random, finer)
+    depth, sigma = (image[:, seen.shape[1] // 2] for image in (seen, bound))
     if noise.resampled > 0.0:
-        chosen = random.coin(noise.resampled, 1, 1)
-        shift = 0.5 * random.uniform(2, 1, 1) * chosen[:, None]
-        depth, sigma = (_resampled(image, shift) for image in (depth, sigma))
+        chosen = random.coin(noise.resampled, 1, 1, 1)
+        means = (image.nanmean(dim=1, keepdim=True) for image in (seen, bound))
+        seen, bound = (torch.where(chosen, *pair) for pair in zip(means, (seen, bound), strict=True))
+        depth, sigma = (image[:, seen.shape[1] // 2] for image in (seen, bound))
     hit = torch.isfinite(depth) & torch.isfinite(sigma)
     gate = scenes.gate[index]
     own = random.coin(noise.own_gate)
@@ -430,8 +463,10 @@ def _draw_crops(scenes: CleanScenes, noise: Noise, crop: int, random: Random) ->
     clean = (depth - start[:, None, None]) / width[:, None, None]
     hit &= (clean >= 0.0) & (clean < 1.0)
     clean = torch.where(hit, clean, 1.0)
-    scale = random.log_between(noise.sigma_scale)[:, None, None]
-    sigma = torch.where(hit, sigma / width[:, None, None], 0.0) * scale
+    seen = (seen - start[:, None, None, None]) / width[:, None, None, None]
+    seen = torch.where((seen >= 0.0) & (seen < 1.0), seen, math.nan)
+    scale = random.log_between(noise.sigma_scale)[:, None, None] / width[:, None, None]
+    sigma, bound = torch.where(hit, sigma * scale, 0.0), bound * scale[:, None]
 
     centres = (torch.arange(BINS, device=depth.device) + 0.5) / BINS
     decay = torch.where(random.coin(0.45), 0.0, random.log_between(noise.decay))
@@ -444,31 +479,23 @@ def _draw_crops(scenes: CleanScenes, noise: Noise, crop: int, random: Random) ->
     camera = torch.stack([-around[:, 0], 1.0 + around.sum(dim=1)], dim=1)
     end = camera.sum(dim=1)[:, None, None]
     reach = torch.where(random.coin(noise.behind)[:, None, None] | ~hit, end, clean)
-    return _Crops(clean, sigma, hit, reach, profile, camera)
+    return _Crops(clean, sigma, hit, reach, profile, camera, seen, bound)
 
 
-def _cut(scenes: CleanScenes, index: Tensor, crop: int, random: Random) -> tuple[Tensor, Tensor]:
-    """Depth and bound of crops, rotated and mirrored in one of eight ways."""
+def _cut(scenes: CleanScenes, index: Tensor, crop: int, random: Random, finer: int) -> tuple[Tensor, Tensor]:
+    """Depth and bound of the subpixels of crops `[B, n, h, w]`, rotated and mirrored in one of eight ways."""
 
     def positions(length: int) -> Tensor:
-        first = random.integer(length - crop + 1, 1)
+        first = random.integer(length // finer - crop + 1, 1)
         along = torch.arange(crop, device=first.device)
-        return first + torch.where(random.coin(0.5, 1), crop - 1 - along, along)
+        place = first + torch.where(random.coin(0.5, 1), crop - 1 - along, along)
+        return finer * place[:, None] + torch.arange(finer, device=first.device)[:, None]  # [B, finer, crop]
 
     rows, columns = positions(scenes.depth.shape[1]), positions(scenes.depth.shape[2])
-    where = index[:, None, None], rows[:, :, None], columns[:, None, :]
-    depth, sigma = scenes.depth[where], scenes.sigma[where]
-    transposed = random.coin(0.5)[:, None, None]
+    where = index[:, None, None, None, None], rows[:, :, None, :, None], columns[:, None, :, None, :]
+    depth, sigma = (values[where].flatten(1, 2) for values in scenes[:2])
+    transposed = random.coin(0.5)[:, None, None, None]
     return torch.where(transposed, depth.mT, depth), torch.where(transposed, sigma.mT, sigma)
-
-
-def _resampled(image: Tensor, shift: Tensor) -> Tensor:
-    """An image `[B, h, w]` shifted by parts of a pixel `[B, 2, 1, 1]`, by bilinear interpolation of what is there."""
-    for axis in (1, 2):
-        next_one = torch.cat([image.narrow(axis, 1, image.shape[axis] - 1), image.narrow(axis, -1, 1)], dim=axis)
-        moved = torch.lerp(image, next_one, shift[:, axis - 1])
-        image = torch.where(torch.isfinite(moved), moved, image)
-    return image
 
 
 def _extent(depth: Tensor, hit: Tensor, gate: Tensor) -> tuple[Tensor, Tensor]:
@@ -495,52 +522,84 @@ def _backscatter_depth(profile: Tensor, reach: Tensor, u: Tensor) -> Tensor:
 
 
 class _Response(NamedTuple):
-    """An instrument response, mean 0: a Gaussian whose sides differ, in half of the samples with a wider one."""
+    """An instrument response, mean 0: a Gaussian whose sides differ.
+
+    In some samples a part of the light is in one that is three times as wide, and another part comes late, by a power
+    law, as in detectors to whose junction carriers diffuse.
+    """
 
     early: Tensor  # deviations of the sides [bins], [B, 1]
     late: Tensor
-    wide: Tensor  # part of the light in one that is three times as wide, [B, 1]
+    wide: Tensor  # part of the light in the wider one, [B, 1]
+    tail: Tensor  # part of the light in the tail, [B, 1]
+    decay: Tensor  # its mean delay [bins], [B, 1]
 
     def before(self, time: Tensor) -> Tensor:
-        """Part of the light before times `[B, n]` or `[B, h, w, n]` [bins]."""
-        shape = (-1, *[1] * (time.ndim - 1))
-        early, late, wide = (part.view(shape) for part in self)
-        both, total = (late - early) * math.sqrt(2.0 / math.pi), early + late
+        """Part of the light before times `[…, n]` [bins]."""
+        both, total = (self.late - self.early) * math.sqrt(2.0 / math.pi), self.early + self.late
+        time = time + self.tail * (self.decay - both)
 
         def one(width: float) -> Tensor:
             at = time / width + both
-            first = 2.0 * early * torch.special.ndtr(at / early).clamp_max(0.5)
-            return (first + late * (2.0 * torch.special.ndtr(at / late) - 1.0).clamp_min(0.0)) / total
+            first = 2.0 * self.early * torch.special.ndtr(at / self.early).clamp_max(0.5)
+            return (first + self.late * (2.0 * torch.special.ndtr(at / self.late) - 1.0).clamp_min(0.0)) / total
 
-        return torch.lerp(one(1.0), one(3.0), wide)
+        slow = 1.0 - (1.0 + 0.5 * (time + both).clamp_min(0.0) / self.decay) ** -3
+        return torch.lerp(torch.lerp(one(1.0), one(3.0), self.wide), slow, self.tail)
 
-    def per_bin(self) -> Tensor:
-        """`[B, 2 _TAPS + 1]`, sum 1."""
+    def per_bin(self, shift: Tensor | float = 0.0) -> Tensor:
+        """`[B, 2 _TAPS + 1]`, sum 1, of a response that comes `shift` bins later, `[B, 1]`."""
         edges = torch.arange(-_TAPS - 0.5, _TAPS + 1.0, device=self.early.device)
-        taps = self.before(edges.expand(len(self.early), -1)).diff(dim=1)
-        return taps / taps.sum(dim=1, keepdim=True)
+        taps = self.before(edges - shift).diff(dim=-1)
+        return taps / taps.sum(dim=-1, keepdim=True)
 
 
 def _draw_response(random: Random) -> _Response:
-    width, ratio = random.log_between((0.6, 2.6), 1), random.log_between((1.0, 3.0), 1)
+    width, ratio = random.log_between((0.6, 3.6), 1), random.log_between((1.0, 3.0), 1)
     ratio = torch.where(random.coin(0.5, 1), 1.0, torch.where(random.coin(0.8, 1), ratio, 1.0 / ratio))
     wide = 0.3 * random.uniform(1) * random.coin(0.3, 1)
-    return _Response(width / ratio.sqrt(), width * ratio.sqrt(), wide)
+    tail = random.between((0.05, 0.8), 1) * random.coin(0.4, 1)
+    return _Response(width / ratio.sqrt(), width * ratio.sqrt(), wide, tail, random.log_between((1.0, 8.0), 1))
+
+
+def _wrong_response(true: Tensor, random: Random) -> tuple[_Response, Tensor]:
+    """A Gaussian for a response `[B, 2 _TAPS + 1]` that is not known well, and where it fits best, `[B, 1]` [bins].
+
+    Its deviation is wrong by up to a factor of 2. Who knows no better has measured the offset with it, too.
+    """
+    place = torch.arange(-_TAPS, _TAPS + 1, device=true.device)
+    width = (true * place.square()).sum(dim=1, keepdim=True).sqrt() * random.log_between(_WRONG, 1)
+    width, none = width.clamp(0.3, _TAPS / 3.0), torch.zeros_like(width)
+    found = _Response(width, width, none, none, none + 1.0)
+    shift = torch.arange(-60.0, 61.0, device=true.device)[:, None] * 0.1
+    shifted = _Response(*(part[..., None] for part in found)).per_bin(shift)  # [B, shifts, 2 _TAPS + 1]
+    fit = (shifted + _FLOOR).log() @ true[..., None]
+    return found, shift[fit[..., 0].argmax(dim=1)]
 
 
 def _draw_counts(
     crops: _Crops, photons: Tensor, background: Tensor, noise: Noise, generator: torch.Generator, bins: int
-) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-    """Poisson counts `[B, h, w, T]`, background per bin `[B, T]` and response `[B, 2 r + 1]` as they are given, and the
-    counts of each pixel, also those beyond the gate, `[B, h, w]`."""
-    clean, sigma, hit, reach, profile, _ = crops
-    device = clean.device
+) -> tuple[Tensor, Tensor, Tensor]:
+    """Poisson counts `[B, h, w, T]`, background per bin `[B, T]` and response `[B, 2 r + 1]` as they are given."""
+    clean, sigma, hit, reach, profile, _, seen, bound = crops
+    device, subpixels = clean.device, seen.shape[1]
     random = Random(len(clean), generator)
     response = _draw_response(random)
+    # Where the response is not known well, depth is where the one that is given fits best.
+    true = response.per_bin()
+    gaussian, fits_at = _wrong_response(true, random)
+    wrong = random.coin(noise.wrong, 1)
+    true, given = torch.where(wrong, response.per_bin(-fits_at), true), torch.where(wrong, gaussian.per_bin(), true)
     # Signal follows the bound: σ ∝ 1/√signal.
     typical = torch.where(hit, sigma, 0.0).flatten(1).sum(1) / hit.flatten(1).sum(1).clamp_min(1)
-    shade = (typical[:, None, None] / sigma.clamp_min(1e-9)).square().clamp(0.05, 4.0)
-    signal = torch.where(hit, shade * photons[:, None, None], 0.0)
+    each = (typical[:, None, None, None] / bound.clamp_min(1e-9)).square().clamp(0.05, 4.0)
+    each = torch.where(seen.isfinite(), each, 0.0)
+    if subpixels > 1:  # in half of the samples all of them, and in half of these with the noise of few photons
+        sees_area, rough = random.coin(0.5, 1, 1, 1), random.coin(0.5, 1, 1, 1)
+        each = torch.where(rough & sees_area, -each * torch.log1p(-random.uniform(*each.shape[1:])), each)
+        middle = torch.arange(subpixels, device=device) == subpixels // 2
+        each = each * torch.where(sees_area, 1.0 / subpixels, middle[:, None, None].float())
+    shade = each.sum(dim=1)
 
     edges = torch.arange(bins + 1, device=device, dtype=torch.float32)
     level = torch.nn.functional.interpolate(profile[:, None], size=bins, mode="nearest")[:, 0]
@@ -553,26 +612,31 @@ def _draw_counts(
     mean = torch.where(hit, shade, 0.0).flatten(1).sum(1) / hit.flatten(1).sum(1).clamp_min(1)
     bright = torch.where(ambient[:, None, None] & hit, shade / mean.clamp_min(1e-3)[:, None, None], 1.0)
 
-    def returns(depth: Tensor, signal: Tensor) -> Tensor:
-        return response.before(edges - (depth * bins)[..., None]).diff(dim=-1).clamp_min_(0.0).mul_(signal[..., None])
-
     second, share = _second_surface(clean, hit, noise, random)
-    rate = returns(clean, signal * (1.0 - share))
-    rate += returns(second, signal * share)
+    rate = torch.zeros(*clean.shape, bins, device=device)
+
+    def add(depth: Tensor, signal: Tensor) -> None:
+        """Shares a return among the two bins whose middles are next to it."""
+        at = (depth.nan_to_num(-9.0) * bins - 0.5)[..., None]
+        near = at.floor() + edges[:2]
+        part = (signal * photons[:, None, None])[..., None] * (1.0 - (near - at).abs())
+        inside = (near >= 0) & (near < bins)
+        rate.scatter_add_(-1, near.long().clamp(0, bins - 1), torch.where(inside, part, 0.0))
+
+    for depth, signal in zip(seen.unbind(dim=1), each.unbind(dim=1), strict=True):
+        add(depth, signal * (1.0 - share))
+    add(second, shade * share)
+    rate = torch.bmm(rate.flatten(1, 2), toeplitz(true, bins).mT).view_as(rate)
     scattered = round(noise.scattered * len(clean))
     if scattered:
         rate[:scattered] = _scattered(rate[:scattered], noise, generator)
     from_before = (edges[:-1] < (reach * bins)[..., None]) | ambient[:, None, None, None]
     rate += level[:, None, None] * bright[..., None] * from_before
     counts = torch.poisson(rate.add_(1e-4), generator=generator)
-    wider = random.log_between((1.0, 12.0), 1, 1) - 1.0  # the camera's gate beyond this one
-    beyond = torch.poisson(wider * background[:, None, None] * bright, generator=generator)
-    total = counts.sum(dim=-1) + beyond
-    # Where they are not known well, background and width of the response are given wrong.
     level = level * torch.where(random.coin(noise.wrong, 1), random.log_between(_WRONG, 1), 1.0)
-    wrong = torch.where(random.coin(noise.wrong, 1), random.log_between(_WRONG, 1).sqrt(), 1.0)
-    given = response._replace(early=response.early * wrong, late=response.late * wrong)
-    return counts, level, given.per_bin(), total
+    height, slope = (random.normal(torch.Size((len(clean), 1))) * random.coin(0.5, 1) for _ in range(2))
+    level = level * torch.exp(_ESTIMATED[0] * height + _ESTIMATED[1] * slope * (place - 0.5))
+    return counts, level, given
 
 
 def _second_surface(clean: Tensor, hit: Tensor, noise: Noise, random: Random) -> tuple[Tensor, Tensor]:
@@ -590,24 +654,21 @@ def _second_surface(clean: Tensor, hit: Tensor, noise: Noise, random: Random) ->
     return second, torch.where(there & random.coin(noise.two_returns, 1, 1), share, 0.0)
 
 
-def _estimate(
-    counts: Tensor, level: Tensor, response: Tensor, total: Tensor, photons: Tensor, histograms: bool
-) -> tuple[Tensor, Tensor, Tensor | None]:
-    """Maximum-likelihood depth over the gate, where there are counts, and with `histograms` the features."""
-    bins = counts.shape[-1]
+def _estimate(counts: Tensor, level: Tensor, response: Tensor, photons: Tensor) -> tuple[Tensor, Tensor]:
+    """Maximum-likelihood depth over the gate, and where there are counts."""
     # Log-likelihood of a return at bin k: Σ_j n_j ln(1 + S h_{j−k} / B_j), for all k at once as a product of matrices.
-    gain = torch.log1p(photons[:, None, None] * toeplitz(response, bins) / level[:, :, None])  # [B, j, k]
+    gain = torch.log1p(photons[:, None, None] * toeplitz(response, counts.shape[-1]) / level[:, :, None])  # [B, j, k]
     score = torch.bmm(counts.flatten(1, 2), gain).view_as(counts)
-    features = extract_features(counts, level[:, None, None], response, total) if histograms else None
-    return highest(score), counts.sum(dim=-1) > 0, features
+    return highest(score), counts.sum(dim=-1) > 0
 
 
 def _scattered(rate: Tensor, noise: Noise, generator: torch.Generator) -> Tensor:
-    """The signal rate `[B, h, w, T]` with a part of it scattered forward; in half of the frames nearly all of it.
+    """The signal rate `[B, h, w, T]` with a part of it scattered forward.
 
     Light that water scatters forward travels farther: its delay is drawn as a sum of two exponentials, after a first
-    delay. It also seems to come from beside the pixel, by an exponential in rows and in columns. Energy is conserved,
-    except for what leaves the gate. The rate may be rough, as histograms of a simulation with few photons are.
+    delay. It also seems to come from beside the pixel, by the sum of two exponentials, one four times as wide. Energy
+    is conserved, except for what leaves the gate. The rate may be rough, as histograms of a simulation with few photons
+    are.
     """
     size, height, width, bins = rate.shape
     device, random = rate.device, Random(size, generator)
@@ -627,14 +688,16 @@ def _scattered(rate: Tensor, noise: Noise, generator: torch.Generator) -> Tensor
     delay, slow = random.log_between(noise.delay, 1, 1), 0.6 * random.uniform(1, 1)
     late = (1.0 - slow) * delayed(delay) + slow * delayed(delay * (2.0 + 4.0 * random.uniform(1, 1)))
     late = delayed(delay * 0.7 * random.uniform(1, 1)) @ late
-    scale = random.log_between(noise.spread, 1, 1)
-    light = torch.bmm(rate.flatten(1, 2), late).view_as(rate)
-    light = torch.matmul(spread(width, scale)[:, None], light)
-    light = torch.bmm(spread(height, scale), light.flatten(2)).view_as(rate)
+    scale, far = random.log_between(noise.spread, 1, 1), 0.7 * random.uniform(1, 1, 1)
+    after = torch.bmm(rate.flatten(1, 2), late).view_as(rate)
+    light = torch.zeros_like(rate)
+    for reach, part in ((scale, 1.0 - far), (4.0 * scale, far)):
+        spread_light = torch.matmul(spread(width, reach)[:, None], after)
+        light += part * torch.bmm(spread(height, reach), spread_light.flatten(2)).view_as(rate)
     rough = random.between(noise.roughness, 1, 1)[..., None]
     if noise.roughness[1] > 0:
         light *= random.normal(rate.shape).mul_(rough).sub_(0.5 * rough.square()).exp_()
-    share = torch.where(random.coin(0.5, 1, 1), random.uniform(1, 1), 0.95 + 0.05 * random.uniform(1, 1))
+    share = random.uniform(1, 1)
     if noise.halo > 0.0:
         share = torch.where(random.coin(noise.halo, 1, 1), random.log_between((0.01, 0.7), 1, 1), share)
     return torch.lerp(rate, light, share[..., None])

@@ -10,7 +10,6 @@ import copy
 import json
 import math
 import os
-import threading
 import time
 import warnings
 from collections.abc import Callable
@@ -23,17 +22,17 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
-from spadwarp.denoise.frames import POOLED
+from spadwarp.denoise.classical import highest
+from spadwarp.denoise.histogram_network import CLOSE, answer, log_likelihood, mean_depth
 from spadwarp.denoise.layers import fixed_order
 from spadwarp.denoise.network_files import load_network, torch_device
-from spadwarp.denoise.networks import ANSWERS, CLOSE, build_network, reads_histograms
+from spadwarp.denoise.networks import build_network
 from spadwarp.denoise.recipe import LEAST_CROP, LEVELS, Noise, TrainingRecipe
 from spadwarp.denoise.samples import Samples, Sizes
 from spadwarp.denoise.synthetic_noise import Batch, CleanScenes, draw_batch, procedural_scenes
 from spadwarp.io.paths import atomic_path
-from spadwarp.io.text import parse_json
 from spadwarp.parallel import interruptible
-from spadwarp.values import ConfigError, FileError, SpadwarpWarning, environment_integer
+from spadwarp.values import ConfigError, FileError, environment_integer
 
 # The loss: the error of depth, and of the network's other answers.
 
@@ -42,9 +41,8 @@ _FINE_FLOOR = 1e-7  # the same for histograms, whose many photons give finer dep
 _WATER = 0.001  # weight of depth where nothing is hit
 _TARGET, _OTHERS = 0.3, 0.04  # weights of the cross-entropies of "sees a target" and of the other two logits
 _NEAR = 0.015  # part of the gate within which a reported depth counts as the target's
-_CHOICE = 0.005  # weight of the cross-entropy of the wide view's depths with those next to the truth
-_TYPICAL = 1.5  # depths count as next to the truth within this times the median error of the answer before
-_LEAST = 5e-4  # or within this [gate widths]
+_OUTLIER = 1e-3  # added to the probability, so that no pixel that nobody can tell outweighs all others
+_BINS, _SEEN = 0.2, 1.0  # weights, for histograms, of the cross-entropies of "right" and of "sees a target"
 
 
 def loss_of(output: Tensor, batch: Batch, *, kind: str) -> Tensor:
@@ -53,32 +51,37 @@ def loss_of(output: Tensor, batch: Batch, *, kind: str) -> Tensor:
     Where nothing is hit the true depth is 1, the end of the gate, with a thousandth of the weight. Crops without a
     target do not count for depth: the network would learn to answer 1 for targets that it can hardly see.
     """
-    depth, logits, chosen, learnt = output.tensor_split([1, 4, 4 + 2 + POOLED], dim=1)
+    depth, logits = output.tensor_split([1], dim=1)
     weight = _WATER + (1.0 - _WATER) * batch.hit
-    floor = _FINE_FLOOR if chosen.shape[1] else _FLOOR
-
-    def error_of(square: Tensor) -> Tensor:
-        """Mean over crops of their mean square, or of its logarithm."""
-        mean = (weight * square).flatten(1).sum(dim=1) / weight.flatten(1).sum(dim=1)
-        return _mean_with_target(mean if kind == "mse" else 0.1 * torch.log(mean + floor), batch.hit)
-
-    error = error_of((depth - batch.clean).square())
+    square = weight * (depth - batch.clean).square()
+    mean = square.flatten(1).sum(dim=1) / weight.flatten(1).sum(dim=1)
+    error = _mean_with_target(mean if kind == "mse" else 0.1 * torch.log(mean + _FLOOR), batch.hit)
     if logits.shape[1]:
-        reported = chosen[:, :1].detach() if chosen.shape[1] else batch.frame[:, :1]
         right = batch.hit * ((depth.detach() - batch.clean).abs() < CLOSE)
-        true = batch.hit * ((reported - batch.clean).abs() < _NEAR)
+        true = batch.hit * ((batch.inputs[0][:, :1] - batch.clean).abs() < _NEAR)
         error = error + _TARGET * _target_error(logits[:, :1], batch)
         for part, truth in ((logits[:, 1:2], right), (logits[:, 2:], true)):
             error = error + _OTHERS * F.binary_cross_entropy_with_logits(part, truth)
-    if chosen.shape[1]:  # the candidates' errors, so that one is chosen and not a mean of several
-        candidates = torch.cat([batch.frame[:, :1], 0.5 + batch.frame[:, 3 : 3 + POOLED]], dim=1)
-        square = (candidates - batch.clean).square() * torch.softmax(chosen[:, 1:], dim=1)
-        error = error + 0.5 * error_of(square.sum(dim=1, keepdim=True))
-    if learnt.shape[1]:  # the same of the wide view, which does not change what is before it
-        depths, weights, last, target = learnt.split([ANSWERS] * 2 + [1, 1], dim=1)
-        error = error + error_of((last - batch.clean).square()) + _CHOICE * _choice_error(depths, weights, batch)
-        error = error + _TARGET * _target_error(target, batch)
     return error
+
+
+def histogram_loss(log_probability: Tensor, target: Tensor, batch: Batch) -> Tensor:
+    """Of a distribution over bins `[B, H, W, T]` and the target's logit `[B, H, W]`; a scalar.
+
+    Error of the mean depth of each crop, on a logarithmic scale; cross-entropies of "right to 1.5 bins" and of "sees a
+    target".
+    """
+    hit, clean, bins = batch.hit[:, 0], batch.clean[:, 0], log_probability.shape[-1]
+    pixels = hit.flatten(1).sum(dim=1).clamp_min(1.0)
+    depth = mean_depth(log_probability, log_probability.exp())
+    square = (hit * (depth - clean).square()).flatten(1).sum(dim=1) / pixels
+    middle = (clean * bins).long().clamp(0, bins - 1)[..., None]
+    middle = (middle + torch.arange(-1, 2, device=middle.device)).clamp(0, bins - 1)
+    right = log_probability.gather(-1, middle).exp().sum(dim=-1)
+    entropy = -torch.log(right + _OUTLIER)
+    entropy = (hit * entropy).flatten(1).sum(dim=1) / pixels
+    error = _mean_with_target(0.5 * torch.log(square + _FINE_FLOOR) + _BINS * entropy, hit)
+    return error + _SEEN * _target_error(target[:, None], batch)
 
 
 def _mean_with_target(error: Tensor, hit: Tensor) -> Tensor:
@@ -88,24 +91,13 @@ def _mean_with_target(error: Tensor, hit: Tensor) -> Tensor:
 
 
 def _target_error(logit: Tensor, batch: Batch) -> Tensor:
-    """Cross-entropy of "sees a target", of the crops that count for it."""
-    entropy = F.binary_cross_entropy_with_logits(logit, batch.hit, reduction="none")
-    return (entropy * batch.judged).mean()
-
-
-def _choice_error(depths: Tensor, scores: Tensor, batch: Batch) -> Tensor:
-    """Cross-entropy of the scores with the depths next to the truth; the first depth is the answer before."""
-    away = (depths.detach() - batch.clean).abs()
-    typical = torch.where(batch.hit > 0, away[:, :1], torch.nan).flatten(1).nanmedian(dim=1).values.nan_to_num(0.01)
-    near = (_TYPICAL * typical).clamp_min(_LEAST)[:, None, None, None]
-    share = torch.softmax((-0.5 * (away / near).square()).clamp_min(-1e4), dim=1)
-    entropy = -(share * scores.log_softmax(dim=1)).sum(dim=1, keepdim=True) * batch.hit
-    return _mean_with_target(entropy.flatten(1).sum(dim=1) / batch.hit.flatten(1).sum(dim=1).clamp_min(1.0), batch.hit)
+    """Cross-entropy of "sees a target"."""
+    return F.binary_cross_entropy_with_logits(logit, batch.hit)
 
 
 # Steps
 
-_EAGER = 12  # steps before one is recorded as a CUDA graph
+_EAGER = 3  # steps of a kind before one is recorded as a CUDA graph
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -139,14 +131,6 @@ def _learning_rate(step: int, recipe: TrainingRecipe) -> float:
     rise = min(1.0, (step + 1) / max(settings.warm_up, 1))
     fall = 0.5 * (1.0 + math.cos(math.pi * step / settings.steps))
     return settings.learning_rate * rise * (0.01 + 0.99 * fall)
-
-
-def _is_report(line: str) -> bool:
-    try:
-        report = parse_json(line)
-    except ValueError:
-        return False
-    return isinstance(report, dict) and {"step", "loss", "psnr"} <= report.keys() and isinstance(report["psnr"], dict)
 
 
 def _difference(stored: Any, recipe: TrainingRecipe) -> str:
@@ -211,7 +195,10 @@ class Run:
         network: Any = build_network(recipe.model)
         if recipe.start is not None:
             network.load_state_dict(load_network(recipe.start).state_dict(), strict=False)
-        self.network = network.to(workers.device).to(memory_format=torch.channels_last)
+        self.counting = recipe.model == "histograms"
+        self.network = network.to(workers.device)
+        if not self.counting:
+            self.network = self.network.to(memory_format=torch.channels_last)
         self.learner = self.network
         if workers.size > 1:
             devices = [workers.device.index] if workers.is_cuda else None
@@ -223,15 +210,13 @@ class Run:
             weight_decay=decay, betas=(0.9, 0.99), fused=workers.is_cuda, capturable=workers.is_cuda,
         )  # fmt: skip
         self.generator = torch.Generator(workers.device).manual_seed(recipe.seed * 1009 + workers.rank)
-        self.samples = Sizes(
-            recipe, workers.rank, workers.size, self.generator, given, histograms=reads_histograms(network)
-        )
+        self.samples = Sizes(recipe, workers.rank, workers.size, self.generator, given, histograms=self.counting)
         self.state = {"network": self.network, "average": self.average, "optimiser": self.optimiser}
         self.loss_sum = torch.zeros((), device=workers.device)  # of the steps since the last report
         self.step, spent = self._resume()
-        self.steps_here = 0
-        self.eager: dict[Samples, int] = {}  # steps that were not replayed
-        self.graphs: dict[Samples, tuple[Any, Tensor]] = {}  # the recorded step and its loss
+        self.eager: dict[Any, int] = {}  # steps that were not replayed, of samples of a kind
+        self.graphs: dict[Any, tuple[Any, Tensor]] = {}  # the recorded step and its loss
+        self.pool: Any = None  # memory that recorded steps share
         self.side: Any = torch.cuda.Stream() if workers.is_cuda else None
         self.last_report, self.timed_from = time.monotonic(), self.step
         self.began = self.last_report - spent
@@ -266,10 +251,7 @@ class Run:
             reports = kept["step"] // settings.interval
             if kept["step"] == settings.steps:
                 reports = math.ceil(kept["step"] / settings.interval)
-            found = self.log.read_text(errors="replace").splitlines(keepends=True)[:reports]
-            if len(lines := [line for line in found if _is_report(line)]) < len(found):
-                text = f"{self.log}: damaged; {len(found) - len(lines)} of its lines are left out"
-                warnings.warn(text, SpadwarpWarning, stacklevel=2)
+            lines = self.log.read_text(errors="replace").splitlines(keepends=True)[:reports]
             with atomic_path(self.log) as temporary:
                 temporary.write_text("".join(lines))
         self.loss_sum += kept.get("loss_sum", 0.0)
@@ -300,8 +282,8 @@ class Run:
         (group,) = self.optimiser.param_groups
         group["lr"] = group["lr"].fill_(rate) if isinstance(group["lr"], Tensor) else rate
         samples = self.samples.of(self.step)
-        if samples in self.graphs:
-            graph, loss = self.graphs[samples]
+        if (kind := samples.kind) in self.graphs:
+            graph, loss = self.graphs[kind]
             graph.replay()
         elif self.workers.is_cuda:
             side = self.side
@@ -315,10 +297,9 @@ class Run:
         _update_mean(self.average, self.network, settings.averaging if self.step > settings.warm_up else 0.0)
         self.loss_sum += loss
         self.step += 1
-        self.steps_here += 1
-        if samples not in self.graphs:
-            self.eager[samples] = self.eager.get(samples, 0) + 1
-            if self.side is not None and self.workers.size == 1 and self.eager[samples] == _EAGER:
+        if kind not in self.graphs:
+            self.eager[kind] = self.eager.get(kind, 0) + 1
+            if self.side is not None and self.workers.size == 1 and self.eager[kind] == _EAGER:
                 self._capture(samples)
 
     def _capture(self, samples: Samples) -> None:
@@ -329,13 +310,14 @@ class Run:
         try:
             graph.register_generator_state(self.generator)
             self.optimiser.zero_grad(set_to_none=True)
-            with torch.cuda.graph(graph):
+            with torch.cuda.graph(graph, pool=self.pool):
                 loss = self._work(samples)
+            self.pool = graph.pool()
         except (RuntimeError, AttributeError) as error:
             warnings.warn(f"no CUDA graph of a training step: {error}", stacklevel=2)
             torch.cuda.synchronize()
             return
-        self.graphs[samples] = graph, loss
+        self.graphs[samples.kind] = graph, loss
 
     def _work(self, samples: Samples) -> Tensor:
         settings, workers = self.recipe.optimiser, self.workers
@@ -343,8 +325,12 @@ class Run:
         self.learner.train()
         batch = samples.batch()
         with torch.autocast(workers.device.type, dtype=torch.bfloat16, enabled=mixed, cache_enabled=False):
-            output = self.learner(batch.frame.contiguous(memory_format=torch.channels_last))
-        loss = loss_of(output.float(), batch, kind=settings.loss)
+            output = self.learner(*batch.inputs)
+        loss = (
+            histogram_loss(output[0], output[1], batch)
+            if self.counting
+            else loss_of(output.float(), batch, kind=settings.loss)
+        )
         self.optimiser.zero_grad(set_to_none=True)
         loss.backward()
         nn.utils.clip_grad_norm_(self.network.parameters(), 1.0)
@@ -391,8 +377,6 @@ PHOTONS = (1.0, 3.0, 10.0, 30.0, 100.0)
 """Signal photons per pixel, a third of the background, at which networks that read histograms are validated."""
 
 _TIMED = 5  # steps after which the duration is foretold
-_PATIENCE = 3.0  # seconds before the first message on how long the samples still take
-_AGAIN = 30.0  # seconds from one such message to the next
 _VALIDATION_SEED = 2**40  # of drawn scenes, far from those of training
 
 
@@ -435,12 +419,11 @@ def fit(
     run = Run(recipe, Path(out), workers, training)
     first, spent = run.step, 0.0
     psnr: dict[float, float] = {}
-    input_psnr = fmean(validation_psnr(nn.Identity(), validation, recipe).values())
+    input_psnr = fmean(validation_psnr(None, validation, recipe).values())
     with interruptible() as interrupted:
         while run.step < settings.steps and not workers.any(interrupted.is_set()):
-            if not _prepared(run, interrupted, notify):
-                break
             began = time.monotonic()
+            run.samples.of(run.step).prepare(run.step)
             run.update()
             spent += time.monotonic() - began
             if run.step % settings.interval == 0 or run.step == settings.steps:
@@ -448,8 +431,7 @@ def fit(
                 run.report(psnr, input_psnr)
             if workers.rank == 0:
                 if notify is not None and run.step == first + _TIMED:
-                    seconds = spent / _TIMED + run.samples.seconds
-                    notify(_duration(workers, seconds, settings.steps - run.step))
+                    notify(_duration(workers, spent / _TIMED, settings.steps - run.step))
                 if progress is not None:
                     progress("steps", run.step, settings.steps)
         if run.step < settings.steps:
@@ -462,24 +444,6 @@ def fit(
     trained = run.finish(psnr or validation_psnr(run.average, validation, recipe), input_psnr)
     workers.close()
     return trained
-
-
-def _prepared(run: Run, interrupted: threading.Event, notify: Callable[[str], None] | None) -> bool:
-    """Draws the samples of the next step; False where it was interrupted. Says now and then how long this takes."""
-    silent = notify is None or run.steps_here > 0 or run.workers.rank > 0
-    began, due, first, advice = time.monotonic(), _PATIENCE, (0.0, 0), _advice(run.workers)
-    for drawn, total in run.samples.prepare(run.step):
-        if run.workers.any(interrupted.is_set()):
-            return False
-        seconds = time.monotonic() - began
-        if not first[1]:
-            first = seconds, drawn  # which loads what is needed, and takes longer than the others
-        elif not silent and notify is not None and seconds > due and drawn < total:
-            left = max(1.0, (seconds - first[0]) * (total - drawn) / (drawn - first[1]))
-            rest = f"{total - drawn} of {total} samples are still to be drawn before the next step"
-            notify(f"{rest}, about {left:.0f} s{advice}")
-            due, advice = seconds + _AGAIN, ""
-    return True
 
 
 def _duration(workers: Workers, seconds: float, steps: int) -> str:
@@ -497,18 +461,18 @@ def _advice(workers: Workers) -> str:
     return (
         " on this CPU; a data-centre GPU trains in minutes. The package has trained weights, which `spadwarp denoise` "
         "uses; fewer steps (optimiser.steps, in a new folder), or start from these weights (start in the recipe), take "
-        "less, and fewer samples (optimiser.pool) are drawn sooner. Ctrl-C keeps a checkpoint of the steps, from which "
-        "the same command resumes; samples are drawn anew"
+        "less. Ctrl-C keeps a checkpoint, from which the same command resumes"
     )
 
 
 @torch.no_grad()
-def validation_psnr(network: nn.Module, scenes: CleanScenes, recipe: TrainingRecipe) -> dict[float, float]:
+def validation_psnr(network: nn.Module | None, scenes: CleanScenes, recipe: TrainingRecipe) -> dict[float, float]:
     """PSNR [dB] over the gate at each of `LEVELS`, or of `PHOTONS` for a recipe of histograms.
 
-    Mean over crops with a target; the same crops and photons every time.
+    Mean over crops with a target; the same crops and photons every time. Without a network, of its input.
     """
-    network.eval()
+    if network is not None:
+        network.eval()
     device, counting, result = scenes.depth.device, recipe.model == "histograms", {}
     plain: dict[str, Any] = {"own_gate": 1.0, "own_profile": 1.0}
     plain |= dict.fromkeys(("dead", "slanted_gate", "unknown_water", "wrong"), 0.0)
@@ -522,7 +486,11 @@ def validation_psnr(network: nn.Module, scenes: CleanScenes, recipe: TrainingRec
             scenes, noise, size=64 if device.type == "cuda" and not counting else 8, crop=recipe.optimiser.crop,
             generator=generator, always_replaced=True, histograms=counting,
         )  # fmt: skip
-        depth = network(batch.frame)[:, :1].float()
+        if network is None:
+            depth = highest(log_likelihood(*batch.inputs))[:, None] if counting else batch.inputs[0][:, :1]
+        else:
+            output = network(*batch.inputs)
+            depth = answer(output[0])[0][:, None] if counting else output[:, :1].float()
         square = (batch.hit * (depth.clamp(0, 1) - batch.clean).square()).flatten(1).sum(dim=1)
         pixels = batch.hit.flatten(1).sum(dim=1)
         valid = pixels > 100

@@ -1,8 +1,7 @@
 """RMSE against signal photons: denoisers on histograms of few photons.
 
 Of fresh scenes beside the best tuned classical estimate of the same counts; or of a Monte Carlo result with its own
-backscatter profile, beside the Cramér–Rao bound. SBR: signal-to-background ratio, signal counts
-over background counts in the gate.
+backscatter profile, beside the Cramér–Rao bound. SBR: signal counts over background counts in the gate.
 """
 
 from __future__ import annotations
@@ -17,10 +16,9 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from spadwarp.denoise.baselines import MEDIAN_WINDOWS, TUNINGS, classical_depth
+from spadwarp.denoise.baselines import CLASSICAL, MEDIAN_WINDOWS, TUNINGS, classical_depth
 from spadwarp.denoise.frames import DepthFrames, depth_frames
-from spadwarp.denoise.histograms import features_of_histograms
-from spadwarp.denoise.inference import METHODS, denoise_frames, estimate, target_threshold
+from spadwarp.denoise.inference import METHODS, denoise_frames, estimate, estimate_histograms, target_threshold
 from spadwarp.denoise.network_files import compared
 from spadwarp.frames.cramer_rao import crlb_from_histogram
 from spadwarp.frames.depth import arrival_time
@@ -241,14 +239,17 @@ def photon_sweep(
     for row, column in np.ndindex(shape):
         for _ in range(frames):
             point: dict[str, Any] = {"photons": photons[column], "sbr": sbr[row], "seed": seed * 1_000_003 + done}
-            noisy, sigma = photon_frame(result, **point, device=device)
+            noisy, sigma, histograms = photon_frame(result, **point)
             start, stop = noisy.gate
             seen = np.isfinite(truth) & np.isfinite(sigma) & (truth >= start) & (truth < stop)
             guess = (stop - start) / np.sqrt(12.0)
             bound[row, column] += float(np.mean(np.minimum(sigma[seen], guess) ** 2)) / frames
             for name, sums in squares.items():  # a median of each window is tried; the others have one variant
                 for total, window in zip(sums, MEDIAN_WINDOWS, strict=False):
-                    found, _ = denoise_frames(noisy, window=window, device=device, **methods[name])
+                    if methods[name]["model"] in ("histograms", *CLASSICAL):
+                        found = estimate_histograms(noisy.depth, **histograms, device=device, **methods[name]).depth
+                    else:
+                        found, _ = denoise_frames(noisy, window=window, device=device, **methods[name])
                     total[row, column] += float(np.mean((found[0][seen] - truth[seen]) ** 2)) / frames
             done += 1
             if progress is not None:
@@ -270,12 +271,10 @@ def photon_sweep(
 
 
 def photon_frame(
-    result: Result, *, photons: float, sbr: float, seed: int, device: str | None = None
-) -> tuple[DepthFrames, NDArray[np.float64]]:
-    """One frame of likelihood depth from Poisson counts, and the Cramér–Rao bound of each pixel `[H, W]` [m].
-
-    The frame also has the features of its histograms, computed on the torch device.
-    """
+    result: Result, *, photons: float, sbr: float, seed: int
+) -> tuple[DepthFrames, NDArray[np.float64], dict[str, Any]]:
+    """One frame of likelihood depth from Poisson counts, the Cramér–Rao bound of each pixel `[H, W]` [m], and the
+    counts as `estimate_histograms` takes them."""
     from scipy.ndimage import convolve1d
 
     scene, gate = result.scene, result.scene.gate
@@ -309,10 +308,11 @@ def photon_frame(
     def to_depth(part: NDArray[np.float32]) -> NDArray[Any]:
         return depth_from_time(gate.start + part.astype(np.float64) * (gate.stop - gate.start), scene=scene)
 
-    features = features_of_histograms(
-        counts, background=background[0, 0], response=matrix, device=device, to_depth=to_depth
-    )
-    return depth_frames(depth, gate=depth_gate, profile=profile, features=features), range_from_time(sigma, index)
+    histograms = {
+        "counts": counts[None], "background": background[0, 0].astype(np.float32), "response": matrix,
+        "bins": slice(None), "to_depth": to_depth,
+    }  # fmt: skip
+    return depth_frames(depth, gate=depth_gate, profile=profile), range_from_time(sigma, index), histograms
 
 
 def draw_photon_sweep(sweep: PhotonSweep, path: str | Path) -> Path:

@@ -240,7 +240,7 @@ def test_counts_are_denoised_with_their_histograms(wall, tmp_path):
 def test_frames_of_many_photons_meet_the_bound(wall):
     frames = [photon_counts.photon_frame(wall, photons=2000.0, sbr=20.0, seed=seed) for seed in range(8)]
     sigma = frames[0][1]
-    spread = np.std([frame.depth[0] for frame, _ in frames], axis=0, ddof=1) / sigma
+    spread = np.std([frame.depth[0] for frame, *_ in frames], axis=0, ddof=1) / sigma
     # 192 pixels, each with 7 degrees of freedom; the estimator treats scattered light as a Gaussian return, too.
     assert 0.8 < np.sqrt(np.nanmedian(spread**2)) < 1.6
 

@@ -57,12 +57,12 @@ def test_settings_of_the_caller_come_back():
 @pytest.mark.parametrize("device", DEVICES)
 @pytest.mark.parametrize("model", MODELS)
 def test_a_seed_gives_the_same_weights(model, device, tmp_path, monkeypatch):
-    """Bit by bit; on a GPU also of the steps that are replayed as a CUDA graph, beside which samples are drawn."""
+    """Bit by bit; on a GPU also of the steps that are replayed as a CUDA graph."""
     monkeypatch.setattr(training, "PHOTONS", (3.0,))  # of a validation, each of which takes seconds
     gpu, counting = device == "cuda", model == "histograms"
     steps, batch = (40, 4) if gpu else (2, 2)
     optimiser = {"steps": steps, "batch": batch, "crop": 32, "wide": 0.5, "scenes": 4, "redraw": 10, "warm_up": 1}
-    optimiser |= {"report_every": steps} | ({"pool": 96, "uses": 6.0} if gpu and counting else {})
+    optimiser |= {"report_every": steps}
     tables = {"model": model, "seed": 3, "optimiser": optimiser, "noise": {"counting": 1.0} if counting else {}}
     recipe, few = TrainingRecipe.from_dict(tables), procedural_scenes(1, 32, seed=1, device="cpu")
     first, second = (

@@ -1,22 +1,16 @@
-"""The samples of a training: a pool that depends on seed and step alone, the mixture of its noises, its scenes."""
-
-import itertools
-import threading
-from types import SimpleNamespace
+"""The samples of a training: the mixture of its noises, its scenes, and areas that pixels see."""
 
 import numpy as np
 import pytest
 import torch
 
-from spadwarp.denoise import samples, training
+from spadwarp.denoise import samples, synthetic_noise
 from spadwarp.denoise.recipe import Noise, Optimiser, Part, TrainingRecipe
-from spadwarp.denoise.samples import PORTIONS, Pool, Scenes, Sizes, crowded, in_open_water
-from spadwarp.denoise.synthetic_noise import Batch, CleanScenes, procedural_scenes
-from spadwarp.values import DeviceError
+from spadwarp.denoise.samples import Sizes, crowded, in_open_water
+from spadwarp.denoise.synthetic_noise import SUBPIXELS, Batch, CleanScenes, draw_batch, procedural_scenes
 
-CPU = torch.device("cpu")
 SHARES = (0.5, 0.3, 0.2)
-OPTIMISER = {"batch": 4, "crop": 32, "scenes": 16, "redraw": 5, "pool": 2 * PORTIONS, "uses": 6.0}
+OPTIMISER = {"batch": 4, "crop": 32, "scenes": 16, "redraw": 10**6}
 MIXTURE = [{"share": share, "photons": [10.0**part, 10.0**part]} for part, share in enumerate(SHARES)]
 MIXTURE[0]["crowded"] = 1.0
 MIXTURE[1]["open_water"] = 1.0
@@ -32,122 +26,72 @@ def test_parts_have_the_noise_of_the_recipe_from_python_too(noise):
     """As tables, as objects, and as a recipe again; what a part gives itself stays."""
     objects = [Part(**{name: tuple(x) if isinstance(x, list) else x for name, x in one.items()}) for one in MIXTURE]
     for mixture in (MIXTURE, tuple(objects)):
-        found = TrainingRecipe(model="histograms", noise=noise, mixture=mixture, optimiser=Optimiser(pool=PORTIONS))
+        found = TrainingRecipe(model="histograms", noise=noise, mixture=mixture, optimiser=Optimiser(**OPTIMISER))
         assert found.mixture == recipe().mixture
         assert found == TrainingRecipe.model_validate(found) == TrainingRecipe.from_dict(found.model_dump())
 
 
 @pytest.fixture
 def drawn(monkeypatch):
-    """Replaces the drawing of noise, which takes long: what it was asked for, and random numbers of its generator."""
+    """Replaces the drawing of noise, which takes long: what it was asked for."""
     asked = []
 
-    def draw(scenes, noise, *, size, crop, generator, histograms, bins):
-        asked.append((scenes, noise, size))
-        one = torch.rand(size, 1, 2, 2, generator=generator) + scenes.gate[:1, :1, None, None]
-        return Batch(one, one.clone(), one.clone(), torch.ones(size, 1, 1, 1))
+    def draw(scenes, noise, *, size, crop, generator, histograms, bins, finer):
+        asked.append((scenes, noise, size, crop, bins))
+        return Batch((torch.rand(size, 1, generator=generator),), *torch.zeros(2, size))
 
     monkeypatch.setattr(samples, "draw_batch", draw)
     return asked
 
 
-def pool(**changes):
-    chosen = recipe(**changes)
-    return Pool(chosen, Scenes(chosen, 0, CPU, None), chosen.optimiser.batch, torch.Generator().manual_seed(1))
-
-
-def sizes(**changes):
-    return Sizes(recipe(**changes), 0, 1, torch.Generator().manual_seed(1), None, histograms=True)
-
-
-def prepare(ours, *steps):
-    """What is still to be drawn, all of it drawn; before the last of the steps."""
-    for step in steps:
-        pieces = list(ours.prepare(step))
-    return pieces
-
-
-def size_of(requests):
-    return sum(size for _, _, size in requests)
-
-
-def test_a_resumed_pool_holds_what_it_would_have_held(drawn):
-    for step in (0, 57):
-        whole, resumed = pool(), pool()
-        prepare(whole, *range(step + 1))
-        prepare(resumed, step)
-        for mine, theirs in zip(whole.memory, resumed.memory, strict=True):
-            filled = int(whole.filled)
-            assert filled == int(resumed.filled) > 0
-            assert torch.equal(mine[:filled], theirs[:filled])
-        assert torch.equal(whole.batch().frame, resumed.batch().frame)
-
-
-def test_a_sample_is_used_as_often_as_asked(drawn):
-    """Once the pool is full: samples taken over samples drawn."""
-    ours = pool(redraw=10**6)
-    first, steps = 200, 300
-    prepare(ours, first)
-    before = len(drawn)
-    prepare(ours, *range(first + 1, first + steps + 1))
-    taken = steps * ours.batch().frame.shape[0]
-    assert taken / size_of(drawn[before:]) == pytest.approx(OPTIMISER["uses"], rel=0.02)
+def batches(steps, **changes):
+    ours = Sizes(recipe(**changes), 0, 1, torch.Generator().manual_seed(1), None, histograms=True)
+    for step in range(steps):
+        ours.of(step).prepare(step)
+        ours.of(step).batch()
 
 
 def test_a_part_of_the_steps_learns_from_fewer_crops_of_twice_the_side(drawn):
-    """As often as asked, with as many pixels a step, and with samples that are used as often as the others; none of
-    the steps, or all of them."""
-    assert [[kind.scenes.crop for kind in sizes(wide=part).kinds] for part in (0.0, 1.0)] == [[32], [64]]
-    ours, steps = sizes(batch=16, wide=0.25, pool=16 * PORTIONS, redraw=10**6), 800
-    assert [(kind.size, kind.scenes.crop) for kind in ours.kinds] == [(16, 32), (4, 64)]
-    first, taken = 300, {32: 0, 64: 0}
-    prepare(ours, first)
-    before = len(drawn)
-    for step in range(first + 1, first + steps + 1):
-        prepare(ours, step)
-        taken[ours.of(step).scenes.crop] += ours.of(step).size
-    assert abs(taken[64] / 4 / steps - 0.25) < 4 * np.sqrt(0.25 * 0.75 / steps)
-    for crop, some in taken.items():
-        new = [request for request in drawn[before:] if request[0].depth.shape[-1] == crop + 32]
-        assert some / size_of(new) == pytest.approx(OPTIMISER["uses"], rel=0.15)  # portions are of whole samples
-
-
-def test_how_many_samples_are_due_is_told_of_both_sizes_together(drawn):
-    """A crop of twice the side counts as four; 8 portions of each before the first step."""
-    ours = sizes(batch=16, wide=0.25, pool=16 * PORTIONS)
-    narrow, wide = (kind.portion for kind in ours.kinds)
-    numbers, wholes = zip(*prepare(ours, 0), strict=True)
-    assert set(wholes) == {8 * (narrow + 4 * wide)} and sorted(numbers) == list(numbers) and numbers[-1] == wholes[0]
-    assert prepare(ours, 0) == []
-
-
-def test_a_pool_takes_only_samples_that_were_drawn(drawn):
-    ours = pool()
-    prepare(ours, 0)
-    seen = {float(value) for value in ours.memory.frame[: int(ours.filled), 0, 0, 0]}
-    for _ in range(50):
-        assert {float(value) for value in ours.batch().frame[:, 0, 0, 0]} <= seen
+    batches(400, batch=16, wide=0.25)
+    crops = np.array([request[2:4] for request in drawn])
+    assert {tuple(one) for one in crops} == {(16, 32), (4, 64)}
+    assert abs(np.mean(crops[:, 1] == 64) - 0.25) < 4 * np.sqrt(0.25 * 0.75 / 400)
 
 
 def test_parts_have_their_shares_and_their_noise(drawn):
-    ours = pool(redraw=10**6)
-    prepare(ours, *range(0, 600 * ours.interval, ours.interval))
-    photons = np.array([noise.photons[0] for _, noise, _ in drawn])
+    batches(400)
+    photons = np.array([noise.photons[0] for _, noise, *_ in drawn])
     for part, share in enumerate(SHARES):
-        error = np.sqrt(share * (1 - share) / len(photons))
-        assert abs(np.mean(photons == 10.0**part) - share) < 4 * error
-    assert {noise.ambient for _, noise, _ in drawn} == {0.4}  # of [noise]
+        assert abs(np.mean(photons == 10.0**part) - share) < 4 * np.sqrt(share * (1 - share) / 400)
+    assert {noise.ambient for _, noise, *_ in drawn} == {0.4}  # of [noise]
+    assert len({bins for *_, bins in drawn}) > 3
+    for scenes, noise, *_ in drawn:
+        share = scenes.depth.isfinite().flatten(1).float().mean(1)
+        assert noise.open_water == 0.0 or ((share > 0.03) & (share < 0.85)).all()
 
 
-def test_crowded_samples_do_not_judge_the_target(drawn):
-    ours = pool()
-    prepare(ours, 0)
-    for number, (scenes, noise, size) in enumerate(drawn):
-        judged = ours.memory.judged[number * size : (number + 1) * size]
-        assert bool(judged.any()) == (noise.crowded == 0.0)
-        if noise.open_water:
-            share = scenes.depth.isfinite().flatten(1).float().mean(1)
-            assert ((share > 0.03) & (share < 0.85)).all()
+def test_a_pixel_sees_the_area_of_its_subpixels():
+    """Halves of the scene 1 m apart, by an edge within the pixels of one column: two thirds of their light is nearer.
+
+    The middle of these pixels, which is their true depth, is nearer, too. Half of the samples see points alone.
+    """
+    side, width = 16, 16 * SUBPIXELS
+    depth = torch.where(torch.arange(width) < 8 * SUBPIXELS + 2, 1.0, 2.0).expand(1, width, width).contiguous()
+    scenes = CleanScenes(depth, torch.ones_like(depth), torch.tensor([[0.5, 2.5]]), torch.ones(1, 64))
+    plain = dict.fromkeys(("scattered", "two_returns", "resampled", "wrong"), 0.0)
+    noise = Noise(counting=1.0, photons=(1e4, 1e4), sbr=(1e3, 1e3), own_gate=1.0, **plain)
+    batch = draw_batch(
+        scenes, noise, size=64, crop=side, generator=torch.Generator().manual_seed(2), histograms=True, bins=64,
+        finer=SUBPIXELS,
+    )  # fmt: skip
+    (counts, _, _), near = batch.inputs, batch.clean < 0.5
+    column = near.float().mean(dim=(2, 3)) * side
+    assert batch.clean.unique().numel() == 2 and ((column == 9) | (column == 7)).all()
+    share = counts[..., :32].sum(dim=-1) / counts.sum(dim=-1)
+    mixed = ((share > 0.1) & (share < 0.9)).flatten(1).sum(dim=1)
+    assert ((mixed == 0) | (mixed > side - 4)).all() and 16 < (mixed > 0).sum() < 48
+    seen = share[(share > 0.1) & (share < 0.9)]
+    assert abs(float(seen.median()) - 2 / 3) < 0.03
 
 
 def test_of_two_scenes_a_pixel_sees_the_nearer():
@@ -164,51 +108,16 @@ def test_of_two_scenes_a_pixel_sees_the_nearer():
     assert in_open_water(wall) is wall  # which has no open water
 
 
-def test_drawing_goes_on_in_pieces_and_an_abandoned_one_begins_again(drawn):
-    whole, stopped = pool(pool=960), pool(pool=960)  # 24 portions of 40 samples
-    pieces = prepare(whole, 0)
-    assert pieces == [(done, pieces[-1][1]) for done in range(8, pieces[-1][1] + 1, 8)]
-    for number, _ in enumerate(stopped.prepare(0)):
-        if number == 7:  # within the second portion
-            break
-    assert prepare(stopped, 0) == pieces
-    assert torch.equal(whole.batch().frame, stopped.batch().frame)
-    assert prepare(whole, 0) == []
-
-
-def test_samples_drawn_on_a_cpu_leave_the_gpu_alone(drawn, monkeypatch):
-    def refuse(*_):
-        raise AssertionError("a GPU is taken up")
-
-    for name in ("stream", "current_stream", "current_device", "Stream"):
-        monkeypatch.setattr(torch.cuda, name, refuse)
-    ours = sizes(wide=0.5)
-    assert prepare(ours, 0)
-    assert all(len(kind.batch().frame) == kind.size for kind in ours.kinds)
-
-
-def test_a_pool_beyond_the_memory_is_refused():
-    problem = r"optimiser\.pool = 9000000 with optimiser\.crop = 64 needs \d+\.\d GiB on cpu"
-    with pytest.raises(DeviceError, match=problem):
-        sizes(pool=9_000_000, crop=64)
-
-
-CLOCKS = {
-    "late": (itertools.count(0.0, 1.6), 4, [2]),  # more than three seconds after the start, not at the last piece
-    "soon": (itertools.count(0.0, 0.8), 4, []),
-    # Every half minute; the first piece, which here takes twenty times as long as the others, does not count.
-    "long": (itertools.chain([0.0], itertools.count(20.0, 1.0)), 100, [98, 67, 36, 5]),
-}
-
-
-@pytest.mark.parametrize("name", CLOCKS)
-def test_how_long_samples_take_is_said(monkeypatch, name):
-    """Of a run whose next step needs so many samples."""
-    (clock, count, rests), heard = CLOCKS[name], []
-    monkeypatch.setattr(training.time, "monotonic", lambda: next(clock))
-    pieces = SimpleNamespace(prepare=lambda step: ((drawn, count) for drawn in range(1, count + 1)))
-    workers = SimpleNamespace(rank=0, is_cuda=True, any=bool)
-    run = SimpleNamespace(step=0, steps_here=0, workers=workers, samples=pieces)
-    assert training._prepared(run, threading.Event(), heard.append)
-    line = "{} of {} samples are still to be drawn before the next step, about {} s"
-    assert heard == [line.format(rest, count, 3 if name == "late" else rest) for rest in rests]
+def test_a_response_that_is_not_known_fits_best_where_the_return_is():
+    """Counts of the true response, matched with the one that is given at half bins; tails do not move it."""
+    random = synthetic_noise.Random(200, torch.Generator().manual_seed(2))
+    response = synthetic_noise._draw_response(random)
+    true = response.per_bin()
+    assert (true >= 0).all() and ((response.tail > 0).float().mean() - 0.4).abs() < 0.15
+    given, at = synthetic_noise._wrong_response(true, random)
+    shifts = torch.arange(-8, 9.0) * 0.5
+    counts = response.per_bin(-at)
+    fit = torch.stack([(counts * (given.per_bin(shift) + 0.01).log()).sum(dim=1) for shift in shifts])
+    assert (shifts[fit.argmax(dim=0)] == 0).float().mean() > 0.95  # less where only fractions of a bin differ
+    deviation = [(one * torch.arange(-32, 33.0).square()).sum(dim=1).sqrt() for one in (true, given.per_bin())]
+    assert 0.3 < (deviation[1] / deviation[0]).min() < 0.7 and 1.5 < (deviation[1] / deviation[0]).max() < 2.2

@@ -11,11 +11,9 @@ from torch.utils.flop_counter import FlopCounterMode
 
 from spadwarp import ConfigError, FileError
 from spadwarp.denoise import network_files, networks
-from spadwarp.denoise.frames import POOLED
-from spadwarp.denoise.histogram_features import FEATURES
 from spadwarp.denoise.recipe import Noise, TrainingRecipe, load_training_recipe
 from spadwarp.denoise.synthetic_noise import BINS, Batch, CleanScenes, draw_batch, procedural_scenes
-from spadwarp.denoise.training import fit, loss_of
+from spadwarp.denoise.training import fit, histogram_loss, loss_of
 
 
 def scenes(count=4, size=64):
@@ -59,21 +57,19 @@ def test_order_statistics_are_those_of_a_sort():
         assert torch.equal(values[:, 0], expected[..., rank])
 
 
-@pytest.mark.parametrize("model", ["pyramid", "histograms"])
-def test_pyramid_turns_with_its_frame(model):
+def test_pyramid_turns_with_its_frame():
     """All eight turns and reflections, with weights drawn at random; and the way with derivatives gives the same."""
     torch.manual_seed(3)
-    network = networks.build_network(model).eval()
+    network = networks.build_network("pyramid").eval()
     with torch.no_grad():
         for values in network.parameters():
             values.add_(0.02 * torch.randn(values.shape))
-    frame = torch.rand(1, 3 + FEATURES * networks.reads_histograms(network), 32, 32)
+    frame = torch.rand(1, 3, 32, 32)
     frame[:, 1] = (frame[:, 1] > 0.2).float()
     learning = network(frame).detach()
     with torch.inference_mode():
         found = network(frame)
-        if model == "pyramid":
-            assert torch.allclose(found, learning, atol=1e-5)
+        assert torch.allclose(found, learning, atol=1e-5)
         for turn in range(8):
             turned = [torch.rot90(x.flip(-1) if turn >= 4 else x, turn % 4, (-2, -1)) for x in (frame, found)]
             close = torch.isclose(network(turned[0]), turned[1], atol=1e-3)
@@ -90,12 +86,6 @@ def test_pyramid_takes_no_depth_from_pixels_that_report_nothing():
         assert torch.allclose(network(frame)[:, 0], torch.tensor(0.5), atol=1e-4)
 
 
-def test_the_answer_is_never_the_mean_of_two_surfaces():
-    candidates, scores = torch.tensor([[0.2, 0.2, 0.7, 0.7]] * 2), torch.tensor([[0, 0, 0.1, 0], [0.1, 0, 0, 0]])
-    found = networks.selected(candidates[:, :, None, None], scores[:, :, None, None])
-    assert torch.allclose(found.flatten(), torch.tensor([0.7, 0.2]))
-
-
 def test_drawn_scenes_are_varied_and_repeatable():
     first, again = (procedural_scenes(40, 48, seed=5, device="cpu") for _ in range(2))
     assert torch.equal(first.depth.nan_to_num(), again.depth.nan_to_num())
@@ -106,15 +96,15 @@ def test_drawn_scenes_are_varied_and_repeatable():
     assert (((first.depth > low) & (first.depth < high)) | ~seen).all()
     assert (first.sigma[seen] > 0).all() and torch.isnan(first.sigma[~seen]).all()
     one, same, other = (draw(Noise(), size=8, seed=seed) for seed in (1, 1, 2))
-    assert torch.equal(one.frame, same.frame) and torch.equal(one.clean, same.clean)
-    assert not torch.equal(one.frame, other.frame)
+    assert torch.equal(one.inputs[0], same.inputs[0]) and torch.equal(one.clean, same.clean)
+    assert not torch.equal(one.inputs[0], other.inputs[0])
 
 
 @pytest.mark.parametrize("level", [0.042, 0.48])
 def test_the_backscatter_fraction_is_that_of_the_recipe(level):
     batch = draw(Noise(backscatter=(level, level), behind=1.0, **PLAIN))
     seen = batch.hit > 0
-    off = (batch.frame[:, :1] - batch.clean).abs() > 5 * 0.002 / 2.5
+    off = (batch.inputs[0][:, :1] - batch.clean).abs() > 5 * 0.002 / 2.5
     missed = 2 * 5 * 0.002 / 2.5  # backscatter at the target's depth by chance, at most twice the mean density
     share, count = float(off[seen].float().mean()), int(seen.sum())
     error = np.sqrt(level * (1 - level) / count)
@@ -124,7 +114,7 @@ def test_the_backscatter_fraction_is_that_of_the_recipe(level):
 def test_backscatter_follows_the_profile_up_to_the_target():
     batch = draw(Noise(backscatter=(1.0, 1.0), behind=0.0, **PLAIN))
     seen = batch.hit > 0
-    reported, clean = batch.frame[:, :1][seen], batch.clean[seen]
+    reported, clean = batch.inputs[0][:, :1][seen], batch.clean[seen]
     assert (reported <= clean + 1e-5).all()
     # Distribution of the profile 1.8 … 0.2: its integral to u is 1.8 u − 0.8 u².
     share = (1.8 * reported - 0.8 * reported**2) / (1.8 * clean - 0.8 * clean**2)
@@ -135,7 +125,7 @@ def test_backscatter_follows_the_profile_up_to_the_target():
 
 
 def test_the_input_holds_the_density_at_the_reported_depth():
-    frame = draw(Noise(backscatter=(0.5, 0.5), **PLAIN)).frame
+    frame = draw(Noise(backscatter=(0.5, 0.5), **PLAIN)).inputs[0]
     reported = frame[:, 1] > 0
     depth, density = frame[:, 0], frame[:, 2]
     assert torch.allclose(density[reported].exp(), 1.8 - 1.6 * depth[reported].clamp(0, 1), atol=0.03)
@@ -144,62 +134,47 @@ def test_the_input_holds_the_density_at_the_reported_depth():
 
 @pytest.mark.parametrize("photons", [4.0, 100.0])
 def test_frames_of_counts_reach_the_bound_where_background_is_rare(photons):
-    """Centroid of n photons: σ/√n, besides 1/12 of a bin's square; σ is 0.6 to 2.6 of 192 bins."""
+    """Centroid of n photons: σ/√n, besides 1/12 of a bin's square; σ is 0.6 to 3.6 of 192 bins."""
     plain = Noise(photons=(photons, photons), sbr=(8.0, 8.0), **{**PLAIN, "counting": 1.0})
     batch = draw(plain, size=12)
-    inner = (batch.hit > 0) & (batch.frame[:, 1:2] > 0)
-    error = (batch.frame[:, :1] - batch.clean)[inner].abs() * 192
-    median = 0.6745 * np.sqrt((1.2**2 + 1 / 12) / photons)
+    inner = (batch.hit > 0) & (batch.inputs[0][:, 1:2] > 0)
+    error = (batch.inputs[0][:, :1] - batch.clean)[inner].abs() * 192
+    median = 0.6745 * np.sqrt((1.5**2 + 1 / 12) / photons)
     assert 0.7 * median < float(error.median()) < 1.7 * median
 
 
-def test_crops_count_for_what_they_can_judge():
-    """Those without a target not for the depth, crowded ones not for the target's probability."""
+def test_crops_without_a_target_do_not_count_for_depth():
     frame, clean, hit = torch.rand(2, 3, 32, 32), torch.full((2, 1, 32, 32), 0.4), torch.ones(2, 1, 32, 32)
     hit[1], clean[1] = 0.0, 1.0
-    both = Batch(frame, clean, hit, torch.ones(2, 1, 1, 1))
-    for batch in (both, Batch(*(values[:1] for values in both))):
-        output = torch.full((len(batch.hit), 1, 32, 32), 0.5)
+    for some in (1, 2):
+        batch = Batch((frame[:some],), clean[:some], hit[:some])
+        output = torch.full((some, 1, 32, 32), 0.5)
         assert loss_of(output, batch, kind="mse") == pytest.approx(0.01, rel=1e-5)
     hit = (torch.rand(1, 1, 32, 32) > 0.5).float()
     depth = torch.full((1, 1, 32, 32), 0.5)
     wrong, right = (torch.cat([depth, 9 * sign * (2 * hit - 1), depth, depth], dim=1) for sign in (-1, 1))
-    for judged in (0.0, 1.0):
-        batch = Batch(frame[:1], depth, hit, torch.full((1, 1, 1, 1), judged))
-        more = loss_of(wrong, batch, kind="mse") - loss_of(right, batch, kind="mse")
-        assert more == pytest.approx(0.3 * 9 * judged, rel=1e-4, abs=1e-6)
+    batch = Batch((frame[:1],), depth, hit)
+    more = loss_of(wrong, batch, kind="mse") - loss_of(right, batch, kind="mse")
+    assert more == pytest.approx(0.3 * 9, rel=1e-4)
 
 
-def test_the_chosen_depth_decides_what_counts_as_the_targets():
-    """With histograms: a chosen depth that is right does not count as wrong because the pixel's own depth is."""
-    hit, candidates = torch.ones(1, 1, 32, 32), torch.zeros(1, 1 + POOLED, 32, 32)
-    batch = Batch(torch.zeros(1, 3 + FEATURES, 32, 32), 0.5 * hit, hit, torch.ones(1, 1, 1, 1))
-    depths = (torch.cat([0.5 * hit, 9 * hit.expand(-1, 3, -1, -1), some * hit, candidates], 1) for some in (0.5, 0.1))
-    right, wrong = depths
-    assert loss_of(right, batch, kind="mse") + 0.2 < loss_of(wrong, batch, kind="mse")
+def test_the_loss_of_a_distribution_is_least_at_the_truth():
+    """The truth lies between bins 20 and 21; a crop of water counts for the target alone."""
+    clean, hit = torch.full((2, 1, 8, 8), 20.9 / 32), torch.ones(2, 1, 8, 8)
+    hit[1] = 0.0
+    batch, logit = Batch((), clean, hit), 20.0 * (2.0 * hit[:, 0] - 1.0)
 
+    def loss(probability, logit=logit):
+        return float(histogram_loss(torch.tensor(probability).log().expand(2, 8, 8, 32), logit, batch))
 
-def test_the_wide_view_learns_from_its_own_answers_alone():
-    """Its errors reach no layer before it, and those of the other layers not its."""
-    torch.manual_seed(5)
-    network = networks.build_network("histograms")
-    frame = torch.rand(1, 3 + FEATURES, 32, 32)
-    batch = Batch(frame, torch.rand(1, 1, 32, 32), torch.ones(1, 1, 32, 32), torch.ones(1, 1, 1, 1))
-    output = network(frame)
-    first = 4 + 2 + POOLED
-    for part, own in ((output[:, :first], False), (output[:, first:], True)):
-        network.zero_grad()
-        rest = torch.cat([output[:, :first].detach(), part], dim=1) if own else part
-        loss_of(rest, batch, kind="psnr").backward(retain_graph=True)
-        for name, values in network.named_parameters():
-            late = name.startswith("context.")
-            learns = values.grad is not None and bool((values.grad != 0).any())
-            assert not (learns and late != own), name
-    assert learns  # the last of the wide view's
+    right, beside, even = np.full((3, 32), 1e-6, np.float32)
+    right[20:22], beside[21:23], even[:] = (0.6, 0.4), (0.6, 0.4), 1 / 32
+    assert loss(right) + 1.0 < loss(beside) < loss(even)
+    assert loss(right, -logit) == pytest.approx(loss(right) + 20.0, rel=1e-3)
 
 
 OPTIMISER = {"steps": 6, "batch": 2, "crop": 32, "report_every": 3, "warm_up": 2}
-COUNTS = {"model": "histograms", "noise": {"counting": 1.0}, "optimiser": {"pool": 48}}
+COUNTS = {"model": "histograms", "noise": {"counting": 1.0}}
 RECIPE = {"model": "usdn", "data": "none", "seed": 4, "optimiser": OPTIMISER}
 
 
@@ -256,7 +231,6 @@ def test_a_training_starts_from_the_weights_of_the_package(tmp_path):
     learnt = load_file(done.weights)
     for name, values in network_files.load_network("histograms").state_dict().items():
         assert torch.allclose(learnt[name].float(), values, atol=0.01), name  # two steps
-    assert "enter_features.weight" in learnt
     validation = network_files.weights_metadata("histograms", done.weights)["validation_psnr"]
     assert set(validation) == {"1.000", "3.000", "10.000", "30.000", "100.000"}
 
@@ -291,8 +265,7 @@ def test_a_folder_holds_one_recipe(tmp_path):
         ({"optimiser": {"crops": 3}}, r"optimiser.crops"),
         ({"model": "histograms"}, r"noise.counting"),
         ({"start": "pyramid"}, r"start"),
-        ({"optimiser": {"pool": 48}}, r"optimiser.pool = 48 with model = 'usdn'"),
-        ({"mixture": [{"share": 1.0}]}, r"optimiser.pool = 0 with a mixture"),
+        ({"mixture": [{"share": 1.0}]}, r"mixture with model = 'usdn'"),
         ({**COUNTS, "mixture": [{"share": 0.4}, {"share": 0.5}]}, r"shares add up to 0.9, not to 1"),
         ({**COUNTS, "mixture": [{"share": 1.0, "photons": [0.0, 2.0]}]}, r"mixture.*photons"),
         ({**COUNTS, "mixture": [{"share": 1.0, "counting": 0.5}]}, r"noise.counting = 0.5"),

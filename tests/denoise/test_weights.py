@@ -260,7 +260,6 @@ def test_depth_outside_the_gate_is_left_out_with_a_warning():
 HISTOGRAMS = {"counts": np.zeros((16, 16, 8)), "background": np.ones(8), "response": np.ones(3)}
 REFUSED = {
     r"depth has shape \(5,\)": {"depth": np.zeros(5)},
-    "counts are of 1 x 1 pixels": HISTOGRAMS | {"counts": np.zeros((1, 1, 8)), "depth": np.full((1, 1), 15.0)},
     "depth is <U1": {"depth": np.full((16, 16), "a")},
     "4 x 40 pixels": {"depth": np.ones((4, 40))},
     "outside": {"depth": -np.ones((16, 16))},

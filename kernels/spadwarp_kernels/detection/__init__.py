@@ -2,4 +2,5 @@
 
 from .arrival_time import *
 from .counts import *
+from .messages import *
 from .significance import *

@@ -1,0 +1,327 @@
+"""The network for histograms: a distribution over the bins of the gate for each pixel.
+
+Its volumes are log-likelihoods of a return in each bin of each pixel, `[B, H, W, T]` [nats]: of the pixel, summed over
+windows, and together with the rest of the frame by belief propagation. The logarithm of the distribution is a weighted
+sum of them and of a prior. A pyramid of three-dimensional convolutions, which sees all volumes in cells of `CELL` bins,
+gives weights and prior. So a return keeps the place that the photons give it, to fractions of a bin; what is learned is
+how much the photons of others tell, where depth jumps, and what light is of no target.
+"""
+
+from __future__ import annotations
+
+from functools import partial
+from itertools import pairwise
+from typing import Any
+
+import torch
+import torch.nn.functional as F
+from torch import Tensor, nn
+
+from spadwarp.denoise.classical import beliefs, highest, pooled
+from spadwarp.denoise.late_light import LIGHT, light_channels
+
+CELL = 4
+"""Bins of a cell."""
+
+_MANY = 256  # images of a convolution
+
+CLOSE = 0.01
+"""A depth this near to the truth is right [gate widths]."""
+
+WINDOWS = (3, 7, 15)
+"""Sides of the windows over which log-likelihoods are summed [pixels]."""
+
+_VOLUMES = 2 + len(WINDOWS)
+_CELLS, _IMAGES = _VOLUMES + 2, _VOLUMES + 3 + LIGHT  # channels of cells, and of images, that the pyramid sees
+_LEAST = 20.0  # differences of log-likelihoods within a pixel are clipped at this for the pyramid
+_LEAST_SIGNAL = 0.05  # counts
+_UNIFORM_SHARE = 0.3  # part of the signal that may come at any time, so that photons far from the return say little
+
+
+def toeplitz(response: Tensor, bins: int) -> Tensor:
+    """Response `[B, 2 r + 1]` in bin j to a return in bin k, `[B, j, k]`."""
+    radius = response.shape[-1] // 2
+    place = torch.arange(bins, device=response.device)
+    distance = place[:, None] - place
+    inside = distance.abs() <= radius
+    return torch.where(inside, response[:, (distance + radius).clamp(0, 2 * radius)], 0.0)
+
+
+def log_likelihood(counts: Tensor, background: Tensor, response: Tensor) -> Tensor:
+    """Log-likelihood ratio of a return in each bin, less what background alone gives on average, `[B, H, W, T]`.
+
+    Σ_j (n_j − B_j) ln(1 + S h_{j−k} / B'_j), so that dim pixels are not drawn to where background is high. S is the
+    mean signal of the frame, h the response, B' the background plus 0.3 S spread evenly over the gate. The sum over
+    pixels is that of the pixels together.
+
+    Args:
+        counts: Histograms over the gate, `[B, H, W, T]`.
+        background: Expected background counts, > 0, of each pixel `[B, H, W, T]` or the same for all `[B, 1, 1, T]`.
+        response: Instrument response per bin centred on its time zero, sum 1, `[B, 2 r + 1]`.
+    """
+    above, bins = counts - background, counts.shape[-1]
+    signal = above.sum(dim=-1).mean(dim=(1, 2)).clamp_min(_LEAST_SIGNAL)
+    floor = background.mean(dim=(1, 2)) + _UNIFORM_SHARE * signal[:, None] / bins
+    template = torch.log1p(signal[:, None, None] / floor[:, :, None] * toeplitz(response, bins))
+    return torch.bmm(above.flatten(1, 2), template).view_as(above)
+
+
+def rebinned(counts: Tensor, background: Tensor, response: Tensor, merged: int) -> tuple[Tensor, Tensor, Tensor]:
+    """The arguments with `merged` bins summed into one; the last may hold fewer."""
+
+    def summed(values: Tensor) -> Tensor:
+        return F.pad(values, (0, -values.shape[-1] % merged)).unflatten(-1, (-1, merged)).sum(dim=-1)
+
+    radius = response.shape[-1] // 2
+    half, reach = merged // 2, -(-radius // merged) * merged
+    response = F.pad(response, (reach + half - radius, reach + merged - 1 - half - radius))
+    return summed(counts), summed(background), summed(response)
+
+
+class _Convolution(torch.autograd.Function):
+    """Two-dimensional convolution whose derivative by the filters is a product of matrices for each image.
+
+    Of thousands of small images, over which no product has to sum at once.
+    """
+
+    @staticmethod
+    def forward(context: Any, image: Tensor, filters: Tensor, bias: Tensor) -> Tensor:
+        context.save_for_backward(image, filters)
+        return F.conv2d(image, filters, bias, padding=1)
+
+    @staticmethod
+    def backward(context: Any, *derivatives: Tensor) -> tuple[Tensor | None, Tensor, Tensor]:
+        (found,), (image, filters) = derivatives, context.saved_tensors
+        by_image = F.conv_transpose2d(found, filters, padding=1) if context.needs_input_grad[0] else None
+        # In rows that end with the padding, a tap is a shift of the whole image.
+        row = image.shape[3] + 2
+        seen = F.pad(image.permute(0, 2, 3, 1), (0, 0, 1, 1, 1, 1)).flatten(1, 2)
+        outside = F.pad(found.permute(0, 2, 3, 1), (0, 0, 0, 2, 0, 2)).flatten(1, 2)
+        shifts = [row * y + x for y in range(3) for x in range(3)]
+        pairs = ((outside[:, : len(outside[0]) - shift], seen[:, shift:]) for shift in shifts)
+        taps = [torch.bmm(after.mT, before).sum(dim=0, dtype=torch.float32) for after, before in pairs]
+        by_filters = torch.stack(taps, dim=-1).unflatten(-1, (3, 3)).to(filters.dtype)
+        return by_image, by_filters, outside.sum(dim=(0, 1), dtype=torch.float32).to(filters.dtype)
+
+
+class _Conv(nn.Conv3d):
+    """Convolution over cells, rows and columns `[B, N, H, W, n]`, by one over rows and columns of which cells beside
+    each other are channels: several times faster, on a GPU too, than one over three dimensions."""
+
+    def __init__(self, before: int, after: int, length: int) -> None:
+        super().__init__(before, after, (3, 3, length))
+
+    def forward(self, x: Tensor) -> Tensor:
+        if self.kernel_size[2] == 3:
+            x = F.pad(x, (0, 0, 0, 0, 0, 0, 1, 1))
+            x = torch.cat([x[:, :-2], x[:, 1:-1], x[:, 2:]], dim=-1)
+        filters, bias = self.weight.permute(0, 4, 1, 2, 3).flatten(1, 2), self.bias
+        image, device = x.flatten(0, 1).permute(0, 3, 1, 2), x.device.type
+        kind = torch.get_autocast_dtype(device) if torch.is_autocast_enabled(device) else x.dtype
+        assert bias is not None
+        given = image.to(kind), filters.to(kind), bias.to(kind)
+        convolved: Any = _Convolution.apply if len(image) > _MANY else partial(F.conv2d, padding=1)
+        found = convolved(*given)
+        return found.permute(0, 2, 3, 1).unflatten(0, x.shape[:2])
+
+
+class _Shrink(nn.Conv3d):
+    """Half as many rows, columns and, of `length` 2, cells, as a product of matrices."""
+
+    def __init__(self, before: int, after: int, length: int) -> None:
+        super().__init__(before, after, (2, 2, length))
+
+    def forward(self, x: Tensor) -> Tensor:
+        length = self.kernel_size[2]
+        parts = x.unflatten(3, (-1, 2)).unflatten(2, (-1, 2)).unflatten(1, (-1, length))  # [B, N, ·, H, 2, W, 2, n]
+        filters = self.weight.permute(4, 2, 3, 1, 0).flatten(0, 3)
+        return parts.permute(0, 1, 3, 5, 2, 4, 6, 7).flatten(4) @ filters + self.bias
+
+
+class _Enlarge(nn.ConvTranspose3d):
+    """Twice as many rows, columns and, of `length` 2, cells; as `_Shrink`."""
+
+    def __init__(self, before: int, after: int, length: int) -> None:
+        super().__init__(before, after, (2, 2, length))
+
+    def forward(self, x: Tensor) -> Tensor:  # type: ignore[override]
+        filters = self.weight.permute(0, 4, 2, 3, 1).flatten(1)
+        parts = (x @ filters).unflatten(-1, (self.kernel_size[2], 2, 2, -1))  # [B, N, H, W, ·, 2, 2, n]
+        found = parts.permute(0, 1, 4, 2, 5, 3, 6, 7).flatten(1, 2).flatten(2, 3).flatten(3, 4)
+        return found + self.bias
+
+
+class _Residual(nn.Module):
+    def __init__(self, width: int, length: int) -> None:
+        super().__init__()
+        self.layers = nn.ModuleList(_Conv(width, width, length) for _ in range(2))
+        nn.init.zeros_(self.layers[-1].weight)  # type: ignore[arg-type]  # begins as the identity
+
+    def forward(self, x: Tensor) -> Tensor:
+        y = x
+        for layer in self.layers:
+            y = layer(F.relu(y))
+        return x + y
+
+
+class _Pyramid(nn.Module):
+    """Levels of features `[B, N, H, W, n]`, each of half as many rows and columns and, of volumes, cells."""
+
+    def __init__(self, widths: tuple[int, ...], *, volumes: bool) -> None:
+        super().__init__()
+        pairs, length, side = list(pairwise(widths)), 3 if volumes else 1, 2 if volumes else 1
+        self.down = nn.ModuleList(_Shrink(wide, narrow, side) for wide, narrow in pairs)
+        self.before = nn.ModuleList(_Residual(width, length) for width in widths[1:])
+        self.deep = _Residual(widths[-1], length)
+        self.up = nn.ModuleList(_Enlarge(narrow, wide, side) for wide, narrow in pairs)
+        self.after = nn.ModuleList(_Residual(width, length if level else 1) for level, width in enumerate(widths[:-1]))
+        self.stride = 2 ** len(pairs)
+
+    def forward(self, x: Tensor) -> Tensor:
+        skipped = []
+        for down, before in zip(self.down, self.before, strict=True):
+            skipped.append(x)
+            x = before(down(F.relu(x)))
+        x = self.deep(x)
+        for up, after, skip in reversed(list(zip(self.up, self.after, skipped, strict=True))):
+            x = after(skip + up(F.relu(x)))
+        return F.relu(x)
+
+
+class HistogramNet(nn.Module):
+    """Distribution over bins, and the logit of "the pixel sees a target"; arguments as those of `log_likelihood`.
+
+    Returns the logarithm of the probabilities, `[B, H, W, T]`, and the logit, `[B, H, W]`. Sizes may be any.
+    """
+
+    def __init__(
+        self, widths: tuple[int, ...] = (16, 32, 48, 64), target_widths: tuple[int, ...] = (48, 64, 96)
+    ) -> None:
+        super().__init__()
+        first = widths[0]
+        self.enter = _Conv(_CELLS, first, 1)
+        self.enter_image = nn.Sequential(
+            nn.Conv2d(_IMAGES, 32, 3, padding=1), nn.ReLU(), nn.Conv2d(32, first, 3, padding=1)
+        )
+        self.pyramid = _Pyramid(widths, volumes=True)
+        self.head = nn.Linear(first, _VOLUMES + 1)
+        self.enter_target = _Conv(2 * first + _IMAGES, target_widths[0], 1)
+        self.target_pyramid = _Pyramid(target_widths, volumes=False)
+        self.target = nn.Linear(target_widths[0], 1)
+        self.stride = self.pyramid.stride
+        with torch.no_grad():
+            self.head.weight.mul_(0.1)
+            self.head.bias.copy_(torch.tensor([-1.0, *(-2.0 - 0.2 * side for side in WINDOWS), 0.0, 0.0]))
+
+    def forward(self, counts: Tensor, background: Tensor, response: Tensor) -> tuple[Tensor, Tensor]:
+        bins, (height, width) = counts.shape[-1], counts.shape[1:3]
+        exact = torch.autocast(counts.device.type, enabled=False)  # log-likelihoods need more than bfloat16
+        with exact, torch.no_grad():
+            volumes = _volumes(counts, background, response)
+            tops = [volume.amax(dim=-1) for volume in volumes]
+            volumes = [volume.sub_(top[..., None]) for volume, top in zip(volumes, tops, strict=True)]
+            cells, images = self._seen(volumes, tops, counts, background, response)
+        found, target = self._weighed(cells, images)
+        with exact:
+            found = found[:, :, :height, :width].float().permute(4, 0, 2, 3, 1)
+            between = _interpolation(found.shape[-1], bins, found.device)
+            score = found[-1] @ between
+            for weight, volume in zip(F.softplus(found[:-1]), volumes, strict=True):
+                score = torch.addcmul(score, weight @ between, volume)
+            return score.log_softmax(dim=-1), target[:, :height, :width].float()
+
+    def _weighed(self, cells: Tensor, images: Tensor) -> tuple[Tensor, Tensor]:
+        """Logarithms of weights, and the prior, of each cell `[B, N, H, W, n]`; the target's logit `[B, H, W]`."""
+        image = self.enter_image(images).permute(0, 2, 3, 1)[:, None]
+        x = self.pyramid(self.enter(cells.permute(0, 4, 2, 3, 1)) + image)
+        ends = x.amax(dim=1, keepdim=True), x.mean(dim=1, keepdim=True), images.permute(0, 2, 3, 1)[:, None]
+        target = self.target_pyramid(self.enter_target(torch.cat(ends, dim=-1)))
+        return self.head(x), self.target(target)[:, 0, ..., 0]
+
+    def _seen(
+        self, volumes: list[Tensor], tops: list[Tensor], counts: Tensor, background: Tensor, response: Tensor
+    ) -> tuple[Tensor, Tensor]:
+        """Channels of cells `[B, n, H, W, N]` and of images `[B, n, H, W]`, filled up to whole strides."""
+        missing = -counts.shape[-1] % (CELL * self.stride)
+
+        def in_cells(cube: Tensor, value: float) -> Tensor:
+            return F.pad(cube, (0, missing), value=value).unflatten(-1, (-1, CELL))
+
+        scores = [0.1 * in_cells(one.clamp_min(-_LEAST), -_LEAST).amax(dim=-1) for one in volumes]
+        above = in_cells(counts - background, 0.0).sum(dim=-1)
+        level = in_cells(background, 0.0).sum(dim=-1)
+        excess = 9.0 * pooled(above, 3) / (9.0 * level + 1.0).sqrt()
+        profile = level.mean(dim=(1, 2), keepdim=True) + 1e-3
+        profile = 0.25 * (profile / profile.mean(dim=-1, keepdim=True)).log()
+        cells = torch.stack([*scores, 0.4 * torch.asinh(excess), profile.expand_as(above)], dim=1)
+        total, around = above.sum(dim=-1), level.sum(dim=-1).expand(above.shape[:-1])
+        offset = torch.arange(response.shape[-1], device=response.device) - response.shape[-1] // 2
+        width = (response * offset.square()).sum(dim=-1).clamp_min(0.1).sqrt()[:, None, None]
+        images = [
+            *(0.3 * torch.asinh(top) for top in tops),
+            0.2 * (total.clamp_min(0.0) + 0.3).log(),
+            0.2 * (around + 0.1).log(),
+            0.5 * width.log().expand_as(around),
+            *light_channels(counts - background, background.mean(dim=(1, 2)), highest(volumes[-1]), response),
+        ]
+        return filled_up(cells, self.stride), filled_up(torch.stack(images, dim=1), self.stride)
+
+
+def _volumes(counts: Tensor, background: Tensor, response: Tensor) -> list[Tensor]:
+    """Log-likelihoods of the pixel, of windows and of belief propagation, each `[B, H, W, T]`."""
+    score = log_likelihood(counts, background, response)
+    return [score, *(side**2 * pooled(score, side) for side in WINDOWS), beliefs(score)]
+
+
+def filled_up(image: Tensor, stride: int) -> Tensor:
+    """`[B, n, H, W, …]` with rows and columns that mirror those before the last, up to multiples of `stride`.
+
+    Copies of the last one would agree in depth, as those of a target do.
+    """
+    for axis in (2, 3):
+        length = image.shape[axis]
+        if length % stride:
+            period = max(1, 2 * length - 2)
+            place = torch.arange(length + -length % stride, device=image.device) % period
+            image = image.index_select(axis, torch.minimum(place, period - place))
+    return image
+
+
+def _interpolation(cells: int, bins: int, device: torch.device) -> Tensor:
+    """Weights `[cells, bins]` of linear interpolation from the middles of cells to those of bins."""
+    place = ((torch.arange(bins, device=device) + 0.5) / CELL - 0.5).clamp_min(0.0)
+    return (1.0 - (place - torch.arange(cells, device=device)[:, None]).abs()).clamp_min(0.0)
+
+
+_FINE = 13  # places over the three bins about the highest one
+
+
+def mean_depth(log_probability: Tensor, probability: Tensor) -> Tensor:
+    """Mean depth over the gate, `[B, H, W]`.
+
+    Within the highest bin and its two neighbours the logarithm is a parabola: the return of many photons is narrower
+    than a bin.
+    """
+    bins = log_probability.shape[-1]
+    middle = log_probability.argmax(dim=-1, keepdim=True).clamp(1, max(1, bins - 2))
+    steps = torch.arange(-1, 2, device=middle.device)
+    before, at, after = log_probability.gather(-1, (middle + steps).clamp(0, bins - 1)).split(1, dim=-1)
+    offset = torch.linspace(-1.5, 1.5, _FINE, device=middle.device)
+    parabola = 0.5 * (after - before) * offset + (0.5 * (after + before) - at) * offset.square()
+    fine = torch.softmax(parabola, dim=-1) @ offset
+    early, late = before.exp()[..., 0], after.exp()[..., 0]
+    return probability @ _places(probability) + ((early + at.exp()[..., 0] + late) * fine - (late - early)) / bins
+
+
+def _places(probability: Tensor) -> Tensor:
+    """Middles of bins over the gate."""
+    bins = probability.shape[-1]
+    return (torch.arange(bins, device=probability.device) + 0.5) / bins
+
+
+def answer(log_probability: Tensor) -> tuple[Tensor, Tensor]:
+    """Mean depth over the gate, and the probability that the depth is right to `CLOSE` of it, `[B, H, W]`."""
+    probability = log_probability.exp()
+    depth = mean_depth(log_probability, probability)
+    near = (_places(probability) - depth[..., None]).abs() <= max(CLOSE, 0.5 / probability.shape[-1])
+    return depth, probability.mul_(near).sum(dim=-1)
