@@ -3,8 +3,8 @@
 1. Truth rays within each pixel, with the laser's footprint, shadows, cosines and attenuation, give the ballistic light
    up to a factor. Light that scattered forward on its way is this light later and blurred, or lights the surfaces
    evenly; backscatter ends at the first surface. Non-negative least squares of such terms predict each component.
-2. The ratio of the tallies to the prediction is smooth. It is averaged over windows of pixels and bins, the bins
-   counted from the pixel's own true path, and the windows are blended by their squared errors.
+2. The ratio of the tallies to the prediction is smooth. It is averaged over windows of pixels and rows of bins, counted
+   from the pixel's own true path and wider far from it, and the windows are blended by their squared errors.
 3. These come from two independent halves of the photons: the product of the halves' residuals has the squared bias as
    its expectation, and the squares of their differences the variance (dual buffers: Rousselle et al. 2012; regression
    on noise-free features: Bitterli et al. 2016; kernels in time: Jarabo et al. 2014).
@@ -16,7 +16,7 @@ import math
 from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 import warp as wp
@@ -41,21 +41,31 @@ Cube = NDArray[np.float32]
 _ORDER = np.array([4, 2, 6, 0, 7, 1, 5, 3])
 _LENS = 4  # times as many rays where they meet the lens at different points
 _STEPS = np.array([0.7548776662, 0.5698402910])  # additive sequence in two dimensions (Roberts 2018)
+_RAYS = 1 << 16  # at a time
 _FINE = 4  # parts of a bin: light that is less than a bin late moves to the next
 # Delays [fine bins] of direct light and of surfaces in even light; of blurred light [bins], by the blur's radius.
 _DELAYS = ((0, 1), (1, 2), (2, 4), (4, 8), (8, 16), (16, 32), (32, 64), (64, 192))
 _EVEN_DELAYS = ((0, 4), (4, 16), (16, 64), (64, 256))
 _BLURRED_DELAYS = ((0, 1), (1, 3), (3, 8), (8, 20), (20, 50))
 _BLURS = (1, 3, 8, 20)  # of two boxes [pixels]
-# Radii of the windows, in pixels and bins, and of the one over which their errors are averaged.
+_ROW = 16  # a row of bins is as wide as this part of its distance from the true path
+# Radii of the windows, in pixels and rows, and of the one over which their errors are averaged.
 _WINDOWS = ((0, 0), (1, 0), (2, 0), (4, 0), (8, 0), (16, 0), (32, 0), (4, 1), (8, 2), (32, 4))
 _AROUND = (16, 1)
 _FLOOR = 1e-3  # of the mean: forward-scattered light where none is predicted
-_ROUNDING = 1e-9  # of the most: what sums of rises and falls leave where no ray sees light
+
+
+class KnownLight(NamedTuple):
+    """What truth rays know, arrays of the device by pixel: light up to a factor, in fine bins."""
+
+    direct: Any  # ballistic light
+    even: Any  # surfaces in even light
+    span: Any  # first and last fine bin with light
+    covered: Any  # the part of a pixel whose surface has light of a bin or of an earlier one, by bin
 
 
 def reconstruct(result: Result, *, device: str | None = None) -> Result:
-    """The result with `Result.reconstruction`: its light without most of the noise; tallies stay as they are.
+    """The result with `Result.reconstruction`: its light without most of its noise; tallies stay as they are.
 
     Of the histogram by component; derivatives and polarised channels are left as they are. Takes about 100 bytes a bin.
 
@@ -68,92 +78,115 @@ def reconstruct(result: Result, *, device: str | None = None) -> Result:
     """
     from scipy.ndimage import distance_transform_edt
 
-    halves = np.stack([half.tallies * half.tally_value[..., None] for half in result.halves], dtype=np.float32)
-    scene, gate, pixels = result.scene, result.scene.gate, result.truth.depth.size
+    share = result.halves[0].photons / result.photons
+    scene, gate, shape, bins = result.scene, result.scene.gate, result.truth.depth.shape, result.scene.gate.bins
     if not scene.has_straight_sight:
         raise ConfigError("reconstruct knows neither [surface] nor scan.mode = 'trajectory'", source=scene.source)
     if (focus := result.focus_distance) is not None:  # lens points matter where a point's image is half a pixel wide
         blur = scene.camera.aperture_radius * np.abs(1.0 / focus - 1.0 / result.truth.depth)
         focus = focus if np.nanmax(blur, initial=0.0) > 0.25 * scene.camera.pixel_tangent else None
     chosen = pick_device(device)
-    direct, even, covered = known_light(scene, focus, chosen)
-    fine: list[Any] = [wp.array(part.reshape(pixels, -1), dtype=float, device=chosen) for part in (direct, even)]
-    ballistic = _delayed(fine[0], (0, 1), _FINE).numpy().reshape(covered.shape)
+    known = known_light(scene, focus, chosen)
+    every = _Rows(wp.zeros(result.truth.depth.size, dtype=int, device=chosen), np.arange(bins + 1))
+    ballistic = every.delayed(known.direct, known.span, (0, 1), _FINE).numpy().reshape(*shape, bins)
     # Scattered light of a pixel without a target is that of the nearest target.
     start = (result.true_path() / scene.medium.pulse_speed - gate.start) / gate.bin_width
     nearest = distance_transform_edt(np.isnan(start), return_distances=False, return_indices=True)
-    aligned = np.clip(np.nan_to_num(np.rint(start[tuple(nearest)])), 0, gate.bins).astype(np.int64)
-    mean = halves.mean(axis=0)
-    predictions = ballistic, _forward(fine[0], fine[1], ballistic, mean[1]), _backscatter(covered, mean[2])
-    found = np.zeros_like(mean)
+    aligned = np.clip(np.nan_to_num(np.rint(start[tuple(nearest)])), 0, bins).astype(np.int32)
+    first = wp.array(aligned.ravel(), dtype=int, device=chosen)
+    rows = _Rows(first, _edges(-int(aligned.max()), bins - int(aligned.min())))
+    value: Any = wp.array(result.tally_value.ravel(), dtype=wp.float64, device=chosen)
+    found, squares = np.zeros((3, *shape, bins), np.float32), np.zeros((3, *shape, bins), np.float32)
 
-    def smooth(k: int) -> Cube:
-        if not (result.tallies[k].any() and predictions[k].any()):
-            found[k] = mean[k]
-            return np.zeros_like(mean[k])
-        predicted = predictions[k] * np.float32(mean[k].sum(dtype=np.float64) / predictions[k].sum(dtype=np.float64))
-        predicted += np.float32(k == 1) * _FLOOR * predicted.mean()
-        start = aligned * (k < 2)
-        light, square = _smoothed(halves[0, k], halves[1, k], predicted, start, chosen)
-        # Windows are chosen by the same noise, which loses rare light: each aligned bin gets its own light back.
-        rows = np.arange(gate.bins) + (start.max() - start)[..., None]
-        traced, kept = (np.bincount(rows.ravel(), cube.ravel()) for cube in (result.component(COMPONENTS[k]), light))
-        found[k] = light * np.divide(traced, kept, out=np.zeros_like(kept), where=kept > 0.0)[rows]
-        return square
+    def smooth(k: int) -> None:
+        halves, mean = sk.HalvesOfTallies(), (result.tallies[k] * result.tally_value[..., None]).astype(np.float32)
+        for name, cube in (("tallies", result.tallies), ("half", result.half)):
+            setattr(halves, name, wp.array(cube[k].reshape(-1, bins), dtype=wp.int64, device=chosen, copy=False))
+        halves.value, halves.share = value, share
+        if k == 0:
+            predicted = ballistic
+        elif k == 1:
+            predicted = _forward(known, ballistic, rows, every, halves)
+        else:
+            predicted = _backscatter(known.covered.numpy().reshape(mean.shape), mean)
+        if not mean.any():
+            return
+        predicted = predicted * np.float32(mean.sum(dtype=np.float64) / max(predicted.sum(dtype=np.float64), 1e-300))
+        predicted += np.float32(k == 1) * _FLOOR * mean.mean()
+        own = rows if k < 2 else _Rows(every.start, _edges(0, bins))
+        found[k], squares[k] = _smoothed(halves, predicted, own, share)
 
     with ThreadPoolExecutor(1 if chosen.is_cuda else 2) as threads:
-        squares = sum(threads.map(smooth, (1, 0, 2)))
-    return replace(result, reconstruction=Reconstruction(histogram=found, error=np.sqrt(squares)))
+        list(threads.map(smooth, (1, 0, 2)))
+    return replace(result, reconstruction=Reconstruction(histogram=found, error=np.sqrt(squares.sum(axis=0))))
 
 
-def known_light(scene: Scene, focus: float | None, device: wp.Device) -> tuple[Cube, Cube, Cube]:
-    """From truth rays: ballistic light and surfaces in even light, `[H, W, fine bin]`; the part of each pixel whose
-    surface has light of a bin or of an earlier one, `[H, W, T]`."""
-    camera, gate, count = scene.camera, scene.gate, scene.gate.bins * _FINE
-    model, shape = build_model(scene, device, build_mesh(scene), camera=False), (camera.height, camera.width)
-    row = count + 2  # what comes after the gate
-    first = np.arange(shape[0] * shape[1]).reshape(shape) * row
-    hits, rises = np.zeros(first.size * row), np.zeros((2, first.size * row))
+def known_light(scene: Scene, focus: float | None, device: wp.Device) -> KnownLight:
+    """From truth rays, also of a lens with this focus [m]."""
+    camera, gate = scene.camera, scene.gate
+    model, pixels = build_model(scene, device, build_mesh(scene), camera=False), camera.height * camera.width
+    light = (wp.zeros((pixels, gate.bins * _FINE), dtype=float, device=device) for _ in range(2))
+    covered = wp.zeros((pixels, gate.bins), dtype=float, device=device)
+    known = KnownLight(*light, wp.zeros(pixels, dtype=wp.vec2i, device=device), covered)
     radius = 0.0 if camera.pinhole or camera.port is not None or focus is None else camera.aperture_radius
-    places = list(_places(radius))
-    for place, lens in places if model.mesh is not None else ():
-        corners = np.stack(np.meshgrid(np.arange(shape[1]), np.arange(shape[0])), axis=-1)
-        view = np.concatenate([image_tangents(camera, corners + place), np.ones((*shape, 1))], axis=-1)
-        view = view - lens / (focus or math.inf)
-        slant = np.linalg.norm(view, axis=-1, keepdims=True)
-        lines = lines_of_sight(scene, view / slant)
-        _, along, normal, reflectance = trace_rays(model, lines.start + lens, lines.direction, shape)
-        point = lines.start + lens + along[..., None] * lines.direction
-        direction, way, path = lines.light_at(point)
-        path = path + along + lines.delay
-        _, free, _, _ = trace_rays(model, point - direction * way[..., None], direction, shape)
-        lit = ~(free < way * (1.0 - 1e-4) - 1e-3) * _footprint(scene, direction)
-        lit *= np.maximum(-(direction * normal).sum(axis=-1), 0.0) / way**2
-        even = reflectance * np.exp(-scene.medium.extinction * path) / slant[..., 0] ** 4
-        at = (path / scene.medium.pulse_speed - gate.start) / scene.gate.bin_width * _FINE
-        # Each ray stands for the part of the surface around it, whose times differ along both axes of the image.
-        towards = (normal * lines.direction).sum(axis=-1)[..., None]
-        slopes = []
-        for unit in np.eye(3)[:2]:
-            axis = unit * camera.pixel_tangent / (slant * len(_ORDER))
-            moved = axis - lines.direction * (normal * axis).sum(axis=-1, keepdims=True) / np.minimum(towards, -1e-3)
-            along_sight, along_light = (moved * lines.direction).sum(axis=-1), (moved * direction).sum(axis=-1)
-            slopes.append(along * (along_sight + along_light) * _FINE / (scene.medium.pulse_speed * gate.bin_width))
-        wide, narrow = np.maximum(*np.abs(slopes)), np.minimum(*np.abs(slopes))
-        inside = np.isfinite(even + lit + wide)
-        hits += np.bincount(first[inside] + np.clip(at[inside], 0, row - 1).astype(np.int64), minlength=hits.size)
-        start, width = at[inside], np.maximum(wide[inside], 1e-3)
-        for sign, moved in ((1.0, -0.5), (-1.0, 0.5)):  # evenly over the width: rises at its start, ends at its stop
-            for part in (-0.25, 0.25):
-                edge = np.clip(start + moved * width + part * narrow[inside], 0.0, count)
-                whole = edge.astype(np.int64)
-                for step, share in ((0, 1.0 - edge + whole), (1, edge - whole)):
-                    for rise, light in zip(rises, (even * lit, even), strict=True):
-                        np.add.at(rise, first[inside] + whole + step, (0.5 * sign / width) * share * light[inside])
-    covered = np.cumsum(hits.reshape(*shape, row), axis=-1)[..., _FINE - 1 : count : _FINE] / len(places)
-    sums = (np.cumsum(rise.reshape(*shape, row), axis=-1)[..., :count] for rise in rises)
-    cubes = *(np.where(part > _ROUNDING * part.max(), part, 0.0) for part in sums), covered
-    return tuple(cube.astype(np.float32) for cube in cubes)  # type: ignore[return-value]
+    places, lens = (np.array(part)[:, None, None] for part in zip(*_places(radius), strict=True))
+    height = max(1, _RAYS // (len(places) * camera.width))
+
+    def add(first: int) -> None:
+        """Rays of rows of the image from this one on."""
+        corners = np.stack(np.meshgrid(np.arange(camera.width), np.arange(first, min(first + height, camera.height))), -1)
+        rays = _trace(scene, model, corners + places, lens, focus)
+        shape = (len(places), corners.shape[0] * camera.width)
+        inputs = [
+            wp.array(part.reshape(*shape, *part.shape[3:]), dtype=dtype, device=device)
+            for part, dtype in zip(rays, (wp.float64, wp.vec2d, wp.vec2), strict=True)
+        ]
+        outputs = [first * camera.width, *known]
+        wp.launch(sk.deposit_kernel, dim=shape[1], inputs=inputs, outputs=outputs, device=device)
+
+    starts = range(0, camera.height, height) if model.mesh is not None else ()
+    for start in starts[:1]:
+        add(start)  # which loads the kernels
+    with ThreadPoolExecutor(1 if device.is_cuda else 2) as threads:
+        list(threads.map(add, starts[1:]))
+    return known
+
+
+def _trace(scene: Scene, model: sk.Model, places: Any, lens: Any, focus: float | None) -> tuple[Any, Any, Any]:
+    """Of rays through places of the image and points of the lens `[ray, H, W]`: time [fine bin], NaN for none, its
+    widths along both axes of the image, ballistic light and that of a surface in even light."""
+    camera, gate, shape = scene.camera, scene.gate, places.shape[:-1]
+    view = np.concatenate([image_tangents(camera, places), np.ones((*shape, 1))], axis=-1)
+    view -= lens / (focus or math.inf)
+    slant = np.linalg.norm(view, axis=-1, keepdims=True)
+    lines, flat = lines_of_sight(scene, view / slant), (shape[0] * shape[1], shape[2])
+    start = lines.start + lens
+
+    def trace(origins: Any, directions: Any) -> list[Any]:
+        found = trace_rays(model, origins.reshape(*flat, 3), directions.reshape(*flat, 3), flat)[1:]
+        return [part.reshape(*shape, *part.shape[2:]) for part in found]
+
+    along, normal, reflectance = trace(start, lines.direction)
+    point = start + along[..., None] * lines.direction
+    direction, way, path = lines.light_at(point)
+    begin = point - direction * way[..., None]
+    free = trace(begin, direction)[0]
+    lit = ~(free < way * (1.0 - 1e-4) - 1e-3) * _footprint(scene, direction)
+    lit *= np.maximum(-(direction * normal).sum(axis=-1), 0.0) / way**2
+    passed = np.exp(-scene.optical_depth(start, point) - scene.optical_depth(begin, point))
+    even = reflectance * passed / slant[..., 0] ** 4
+    fine = _FINE / (scene.medium.pulse_speed * gate.bin_width)
+    time = (path + along + lines.delay) * fine - gate.start / gate.bin_width * _FINE
+    # Each ray stands for the part of the surface around it, whose times differ along both axes of the image.
+    towards = (normal * lines.direction).sum(axis=-1)[..., None]
+    slopes = []
+    for unit in np.eye(3)[:2]:
+        axis = unit * camera.pixel_tangent / (slant * len(_ORDER))
+        moved = axis - lines.direction * (normal * axis).sum(axis=-1, keepdims=True) / np.minimum(towards, -1e-3)
+        slopes.append(along * (moved * (lines.direction + direction)).sum(axis=-1) * fine)
+    wide, narrow = np.maximum(*np.abs(slopes)), np.minimum(*np.abs(slopes))
+    time[~np.isfinite(even + lit + wide)] = np.nan
+    return time, np.stack([np.maximum(wide, 1e-3), narrow], axis=-1), np.stack([even * lit, even], axis=-1)
 
 
 def _places(radius: float) -> Iterator[tuple[NDArray[Any], NDArray[Any]]]:
@@ -180,36 +213,73 @@ def _footprint(scene: Scene, direction: NDArray[np.float64]) -> NDArray[np.float
     return np.exp(-2.0 * (cosine**-2 - 1.0) / math.tan(beam.half_angle) ** 2) / cosine**3
 
 
-def _delayed(fine: wp.array, delay: tuple[int, int], per_bin: int) -> wp.array:
-    """Light `[pixel, fine bin]` by a delay of so many fine bins, in bins."""
-    late = wp.empty((fine.shape[0], fine.shape[1] // per_bin), dtype=float, device=fine.device)
-    wp.launch(sk.delay_kernel, dim=fine.shape[0], inputs=[fine, *delay, per_bin, late], device=fine.device)
-    return late
+def _edges(low: int, high: int) -> NDArray[np.int64]:
+    """Edges of rows of bins around 0, from at most `low` to at least `high`."""
+    ends = [0]
+    while ends[-1] < max(-low, high):
+        ends.append(ends[-1] + max(1, ends[-1] // _ROW))
+    sides = np.array(ends)
+    return np.concatenate([-sides[1 : np.searchsorted(sides, -low) + 1][::-1], sides[: np.searchsorted(sides, high) + 1]])
 
 
-def _forward(direct: Any, even: Any, ballistic: Cube, light: Cube) -> Cube:
+class _Rows:
+    """Rows of bins, which count from a bin of each pixel."""
+
+    def __init__(self, start: Any, edges: NDArray[np.int64]) -> None:
+        self.start, self.count = start, len(edges) - 1
+        self.edges: Any = wp.array(edges, dtype=int, device=start.device)
+
+    def delayed(self, light: Any, span: Any, delay: tuple[int, int], per_bin: int, factor: float = 1.0, to: Any = None):
+        """Light `[pixel, fine bin]` by a delay of so many fine bins, times a factor, `[pixel, row]`; added to `to`."""
+        device = light.device
+        to = wp.zeros((light.shape[0], self.count), dtype=float, device=device) if to is None else to
+        inputs = [light, span, wp.vec2i(*delay), per_bin, self.start, self.edges, factor, to]
+        wp.launch(sk.delay_kernel, dim=light.shape[0], inputs=inputs, device=device)
+        return to
+
+    def gathered(self, halves: Any, predicted: Any, scale: float) -> Cube:
+        """Halves, variance of their mean and prediction over `scale`, `[pixel, row, 4]`."""
+        gathered = wp.empty((predicted.shape[0], self.count), dtype=wp.vec4, device=predicted.device)
+        inputs = [halves, predicted, self.start, self.edges, scale, gathered]
+        wp.launch(sk.gather_kernel, dim=gathered.shape, inputs=inputs, device=predicted.device)
+        return gathered.numpy()
+
+
+def _forward(known: KnownLight, ballistic: Cube, rows: _Rows, every: _Rows, halves: Any) -> Cube:
     """Prediction of forward-scattered light from its tallies."""
     from scipy.ndimage import uniform_filter
     from scipy.optimize import nnls
 
-    terms = [_delayed(direct, delay, _FINE).numpy() for delay in _DELAYS]
-    terms += [_delayed(even, delay, _FINE).numpy() for delay in _EVEN_DELAYS]
+    device, (height, width, bins) = known.direct.device, ballistic.shape
+    terms: list[Any] = [(known.direct, known.span, delay, _FINE) for delay in _DELAYS]
+    terms += [(known.even, known.span, delay, _FINE) for delay in _EVEN_DELAYS]
+    lit = np.flatnonzero(ballistic.any(axis=(0, 1)))
+    first, last = (lit[0], lit[-1] + 1) if len(lit) else (0, 0)
+    span = wp.full(len(known.span), wp.vec2i(int(first), int(last)), dtype=wp.vec2i, device=device)
     for radius in _BLURS:
         box = {"size": (2 * radius + 1, 2 * radius + 1, 1), "mode": "constant"}
-        blurred = uniform_filter(uniform_filter(ballistic, **box), **box)
-        pixels: Any = wp.array(blurred.reshape(direct.shape[0], -1), dtype=float, device=direct.device)
-        terms += [_delayed(pixels, delay, 1).numpy() for delay in _BLURRED_DELAYS]
-    sums = [float(term.sum(dtype=np.float64)) for term in terms]
-    rows = np.stack([term.ravel() / total for term, total in zip(terms, sums, strict=True) if total > 0.0])
+        blurred = np.zeros_like(ballistic)
+        blurred[..., first:last] = uniform_filter(uniform_filter(ballistic[..., first:last], **box), **box)
+        pixels: Any = wp.array(blurred.reshape(-1, bins), dtype=float, device=device)
+        terms += [(pixels, span, delay, 1) for delay in _BLURRED_DELAYS]
+    columns = np.stack([rows.delayed(*term).numpy().ravel() for term in terms])
+    columns /= (sums := np.maximum(columns.sum(axis=1), 1e-30))[:, None]
+    ones = wp.ones((height * width, bins), dtype=float, device=device)
+    gathered = rows.gathered(halves, ones, 1.0)
+    light = (0.5 * (gathered[..., 0] + gathered[..., 1])).reshape(height, width, -1)
     # Weights: the variance of light is about proportional to it.
     level = uniform_filter(light, (7, 7, 5), mode="constant").ravel()
     root = 1.0 / np.sqrt(level + 0.02 * level.max() + 1e-300)
-    rows *= root
+    columns *= root
     # Least squares by the products of the terms, of which float32 leaves no more than its rounding.
-    values, vectors = np.linalg.eigh((rows @ rows.T).astype(np.float64))
+    values, vectors = np.linalg.eigh((columns @ columns.T).astype(np.float64))
     scale = np.sqrt(np.maximum(values, np.finfo(np.float32).eps * values[-1]))[:, None]
-    factors, _ = nnls(scale * vectors.T, (vectors.T / scale) @ (rows @ (light.ravel() * root)))
-    return ((factors.astype(np.float32) @ rows) / root).reshape(light.shape)
+    factors, _ = nnls(scale * vectors.T, (vectors.T / scale) @ (columns @ (light.ravel() * root)))
+    total = wp.zeros((height * width, bins), dtype=float, device=device)
+    for term, factor in zip(terms, factors / sums, strict=True):
+        if factor > 0.0:
+            every.delayed(*term, factor=factor, to=total)
+    return total.numpy().reshape(ballistic.shape)
 
 
 def _backscatter(covered: Cube, light: Cube) -> Cube:
@@ -219,18 +289,16 @@ def _backscatter(covered: Cube, light: Cube) -> Cube:
     return sum(part * (total / np.maximum(pixels, 1e-6)) for part, total, pixels in parts)  # type: ignore[return-value]
 
 
-def _smoothed(first: Cube, second: Cube, predicted: Cube, start: Any, device: wp.Device) -> tuple[Cube, Cube]:
-    """Light of a component and its squared error `[H, W, T]`. `start`: bin from which those of a pixel are counted."""
-    bins, shift = first.shape[-1], int(start.max()) - start
-    rows = np.arange(bins) + shift[..., None]
-    cubes = [first, second, 0.25 * (first - second) ** 2, predicted]
-    shape = (*first.shape[:2], bins + int(shift.max()))
-    aligned = np.zeros((*shape, 4), np.float32)
-    for k, cube in enumerate(cubes):
-        np.put_along_axis(aligned[..., k], rows, cube, axis=-1)
-    scale = float(predicted.max())  # float32 holds the squares of what is near 1
-    aligned *= np.array([1.0, 1.0, 1.0 / scale, 1.0], np.float32) / scale
-    values: Any = wp.array(aligned, dtype=wp.vec4, device=device)
+def _smoothed(halves: Any, predicted: Cube, rows: _Rows, share: float) -> tuple[Cube, Cube]:
+    """Light of a component and its squared error `[H, W, T]`."""
+    device = rows.start.device
+    flat: Any = wp.array(predicted.reshape(-1, predicted.shape[-1]), dtype=float, device=device)
+    scale = float(predicted.max()) or 1.0  # float32 holds the squares of what is near 1
+    gathered = rows.gathered(halves, flat, scale)
+    lit = np.flatnonzero(gathered[..., 3].any(axis=0))
+    first, last = (lit[0], lit[-1] + 1) if len(lit) else (0, 1)
+    shape = (*predicted.shape[:2], int(last - first))
+    values: Any = wp.array(gathered[:, first:last].reshape(*shape, 4), dtype=wp.vec4, device=device)
     sums, work, risk, around, blended = (wp.zeros(shape, dtype=wp.vec4, device=device) for _ in range(5))
     for window in _WINDOWS:
         sk.window_sums(values, window, work, sums)
@@ -239,10 +307,18 @@ def _smoothed(first: Cube, second: Cube, predicted: Cube, start: Any, device: wp
         wp.launch(sk.blend_kernel, dim=shape, inputs=[values, sums, around, blended], device=device)
     wp.launch(sk.combine_kernel, dim=shape, inputs=[values, blended, sums], device=device)
     sk.window_sums(sums, _AROUND, work, around)
-    found, own, near = blended.numpy(), sums.numpy()[..., 1:3], around.numpy()
+    own, found, squares, near = (array.numpy() for array in (values, blended, sums, around))
     # One standard error more than the halves show. A window holds its own voxel: differences of float32 leave less.
-    bias = np.maximum(near[..., 0] + np.sqrt(np.maximum(near[..., 3], 0.0) * own[..., 1]), 0.0)
-    bias *= own[..., 1] / np.maximum(np.maximum(near[..., 2], own[..., 1]), 1e-30)
-    light = 0.5 * scale * np.maximum(found[..., 0] + found[..., 1], 0.0)  # differences of float32 end below 0
-    square = scale**2 * (own[..., 0] + bias)
-    return tuple(np.take_along_axis(cube, rows, axis=-1) for cube in (light, square))  # type: ignore[return-value]
+    bias = np.maximum(near[..., 0] + np.sqrt(np.maximum(near[..., 3], 0.0) * squares[..., 2]), 0.0)
+    bias *= squares[..., 2] / np.maximum(np.maximum(near[..., 2], squares[..., 2]), 1e-30)
+    light = 0.5 * np.maximum(found[..., 0] + found[..., 1], 0.0)  # differences of float32 end below 0
+    # Windows are chosen by the same noise, which loses rare light: each row gets its own light back.
+    traced, kept = (part.sum(axis=(0, 1), dtype=np.float64) for part in (own[..., :2] @ [share, 1.0 - share], light))
+    light *= np.divide(traced, kept, out=np.zeros_like(kept), where=kept > 0.0)
+    ratios = np.stack([light, squares[..., 1] + bias], axis=-1)
+    ratios /= np.maximum(own[..., 3:], 1e-30) ** [1, 2]
+    outputs: list[Any] = [wp.zeros_like(flat) for _ in range(2)]
+    edges = rows.edges[int(first) : int(last) + 1]
+    inputs = [halves, flat, rows.start, edges, wp.array(ratios.reshape(-1, shape[2], 2), dtype=wp.vec2, device=device)]
+    wp.launch(sk.scatter_kernel, dim=(flat.shape[0], shape[2]), inputs=[*inputs, *outputs], device=device)
+    return tuple(part.numpy().reshape(predicted.shape) for part in outputs)  # type: ignore[return-value]
