@@ -521,7 +521,10 @@ class Medium(PhaseLaw, Water):
             return self.extinction * length
         axis = np.array(self.layer_axis) / math.hypot(*self.layer_axis)
         heights = np.array(np.broadcast_arrays(first @ axis, last @ axis))
-        starts, extinction = [layer.start for layer in self.layers], np.array([water.extinction for water in self.waters])
+        starts, extinction = (
+            [layer.start for layer in self.layers],
+            np.array([water.extinction for water in self.waters]),
+        )
         here = extinction[np.searchsorted(starts, heights[0], side="right")]
         across = extinction[0] * (heights[1] - heights[0])
         for start, more in zip(starts, np.diff(extinction), strict=True):

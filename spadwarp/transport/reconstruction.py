@@ -25,14 +25,15 @@ from numpy.typing import NDArray
 import spadwarp_kernels as sk
 from spadwarp.device import pick_device
 from spadwarp.mesh import build_mesh
-from spadwarp.result import COMPONENTS, Reconstruction, Result
+from spadwarp.result import Reconstruction, Result
 from spadwarp.scene import Scene
 from spadwarp.scene.camera import image_tangents
 from spadwarp.scene.sight import lines_of_sight
 from spadwarp.transport.model import build_model, trace_rays
-from spadwarp.values import ConfigError
+from spadwarp.transport.simulation import DEFAULT_TIME
+from spadwarp.values import ConfigError, check_real
 
-__all__ = ["known_light", "reconstruct"]
+__all__ = ["known_light", "reconstruct", "tracing_time"]
 
 Cube = NDArray[np.float32]
 
@@ -48,11 +49,20 @@ _DELAYS = ((0, 1), (1, 2), (2, 4), (4, 8), (8, 16), (16, 32), (32, 64), (64, 192
 _EVEN_DELAYS = ((0, 4), (4, 16), (16, 64), (64, 256))
 _BLURRED_DELAYS = ((0, 1), (1, 3), (3, 8), (8, 20), (20, 50))
 _BLURS = (1, 3, 8, 20)  # of two boxes [pixels]
-_ROW = 16  # a row of bins is as wide as this part of its distance from the true path
+_ROW = 8  # a row of bins is as wide as this part of its distance from the true path
 # Radii of the windows, in pixels and rows, and of the one over which their errors are averaged.
 _WINDOWS = ((0, 0), (1, 0), (2, 0), (4, 0), (8, 0), (16, 0), (32, 0), (4, 1), (8, 2), (32, 4))
 _AROUND = (16, 1)
+_ROW_WINDOWS, _ROW_AROUND = tuple((0, reach) for reach in (0, 1, 2, 4, 8)), (0, 4)  # of sums over all pixels
+_COST = 1e-6, 5e-8  # seconds that a bin takes on two cores, on a GPU
 _FLOOR = 1e-3  # of the mean: forward-scattered light where none is predicted
+
+
+def tracing_time(scene: Scene, time: float | None, device: str | None = None) -> float:
+    """Seconds for the photons of a run of so many [s], by default 60, that `reconstruct` ends; half of them at least."""
+    seconds = DEFAULT_TIME if time is None else check_real("time", time, "(0, 1e9] s")
+    bins = scene.camera.height * scene.camera.width * scene.gate.bins
+    return max(seconds - bins * _COST[pick_device(device).is_cuda], 0.5 * seconds)
 
 
 class KnownLight(NamedTuple):
@@ -114,7 +124,7 @@ def reconstruct(result: Result, *, device: str | None = None) -> Result:
         predicted = predicted * np.float32(mean.sum(dtype=np.float64) / max(predicted.sum(dtype=np.float64), 1e-300))
         predicted += np.float32(k == 1) * _FLOOR * mean.mean()
         own = rows if k < 2 else _Rows(every.start, _edges(0, bins))
-        found[k], squares[k] = _smoothed(halves, predicted, own, share)
+        found[k], squares[k] = _smoothed(halves, predicted, own, share, scattered=k > 0)
 
     with ThreadPoolExecutor(1 if chosen.is_cuda else 2) as threads:
         list(threads.map(smooth, (1, 0, 2)))
@@ -134,7 +144,9 @@ def known_light(scene: Scene, focus: float | None, device: wp.Device) -> KnownLi
 
     def add(first: int) -> None:
         """Rays of rows of the image from this one on."""
-        corners = np.stack(np.meshgrid(np.arange(camera.width), np.arange(first, min(first + height, camera.height))), -1)
+        corners = np.stack(
+            np.meshgrid(np.arange(camera.width), np.arange(first, min(first + height, camera.height))), -1
+        )
         rays = _trace(scene, model, corners + places, lens, focus)
         shape = (len(places), corners.shape[0] * camera.width)
         inputs = [
@@ -219,7 +231,9 @@ def _edges(low: int, high: int) -> NDArray[np.int64]:
     while ends[-1] < max(-low, high):
         ends.append(ends[-1] + max(1, ends[-1] // _ROW))
     sides = np.array(ends)
-    return np.concatenate([-sides[1 : np.searchsorted(sides, -low) + 1][::-1], sides[: np.searchsorted(sides, high) + 1]])
+    return np.concatenate(
+        [-sides[1 : np.searchsorted(sides, -low) + 1][::-1], sides[: np.searchsorted(sides, high) + 1]]
+    )
 
 
 class _Rows:
@@ -289,36 +303,47 @@ def _backscatter(covered: Cube, light: Cube) -> Cube:
     return sum(part * (total / np.maximum(pixels, 1e-6)) for part, total, pixels in parts)  # type: ignore[return-value]
 
 
-def _smoothed(halves: Any, predicted: Cube, rows: _Rows, share: float) -> tuple[Cube, Cube]:
+def _smoothed(halves: Any, predicted: Cube, rows: _Rows, share: float, scattered: bool) -> tuple[Cube, Cube]:
     """Light of a component and its squared error `[H, W, T]`."""
-    device = rows.start.device
+    device, pixels = rows.start.device, predicted.shape[:2]
     flat: Any = wp.array(predicted.reshape(-1, predicted.shape[-1]), dtype=float, device=device)
     scale = float(predicted.max()) or 1.0  # float32 holds the squares of what is near 1
     gathered = rows.gathered(halves, flat, scale)
     lit = np.flatnonzero(gathered[..., 3].any(axis=0))
-    first, last = (lit[0], lit[-1] + 1) if len(lit) else (0, 1)
-    shape = (*predicted.shape[:2], int(last - first))
-    values: Any = wp.array(gathered[:, first:last].reshape(*shape, 4), dtype=wp.vec4, device=device)
-    sums, work, risk, around, blended = (wp.zeros(shape, dtype=wp.vec4, device=device) for _ in range(5))
-    for window in _WINDOWS:
-        sk.window_sums(values, window, work, sums)
-        wp.launch(sk.estimate_kernel, dim=shape, inputs=[values, sums, risk], device=device)
-        sk.window_sums(risk, _AROUND, work, around)
-        wp.launch(sk.blend_kernel, dim=shape, inputs=[values, sums, around, blended], device=device)
-    wp.launch(sk.combine_kernel, dim=shape, inputs=[values, blended, sums], device=device)
-    sk.window_sums(sums, _AROUND, work, around)
-    own, found, squares, near = (array.numpy() for array in (values, blended, sums, around))
-    # One standard error more than the halves show. A window holds its own voxel: differences of float32 leave less.
-    bias = np.maximum(near[..., 0] + np.sqrt(np.maximum(near[..., 3], 0.0) * squares[..., 2]), 0.0)
-    bias *= squares[..., 2] / np.maximum(np.maximum(near[..., 2], squares[..., 2]), 1e-30)
-    light = 0.5 * np.maximum(found[..., 0] + found[..., 1], 0.0)  # differences of float32 end below 0
-    # Windows are chosen by the same noise, which loses rare light: each row gets its own light back.
-    traced, kept = (part.sum(axis=(0, 1), dtype=np.float64) for part in (own[..., :2] @ [share, 1.0 - share], light))
-    light *= np.divide(traced, kept, out=np.zeros_like(kept), where=kept > 0.0)
-    ratios = np.stack([light, squares[..., 1] + bias], axis=-1)
-    ratios /= np.maximum(own[..., 3:], 1e-30) ** [1, 2]
+    first, last = (int(lit[0]), int(lit[-1]) + 1) if len(lit) else (0, 1)
+    values = gathered[:, first:last].reshape(*pixels, last - first, 4)
+    light, square = _blended(values, _WINDOWS, _AROUND, device)
+    # Windows are chosen by the same noise, which loses rare light: rows get their own light back, with its noise.
+    total = values.sum(axis=(0, 1), dtype=np.float64, keepdims=True)
+    traced = total[..., :2].sum(axis=(0, 1, 2)) @ [share, 1.0 - share]
+    total /= max(float(total[..., 3].max()), 1e-30)
+    total[..., 2] = 0.25 * (total[..., 0] - total[..., 1]) ** 2
+    reaches = _ROW_WINDOWS if scattered else _ROW_WINDOWS[:1]
+    whole, its = _blended(total.astype(np.float32), reaches, _ROW_AROUND, device)
+    kept = light.sum(axis=(0, 1), dtype=np.float64, keepdims=True) / (traced / max(float(whole.sum()), 1e-30))
+    light = light * np.divide(whole, kept, out=np.zeros_like(kept), where=kept > 0.0)
+    square += light**2 * np.divide(its, whole**2, out=np.zeros_like(kept), where=whole > 0.0)
+    ratios = np.stack([light, square], axis=-1) / np.maximum(values[..., 3:], 1e-30) ** [1, 2]
     outputs: list[Any] = [wp.zeros_like(flat) for _ in range(2)]
-    edges = rows.edges[int(first) : int(last) + 1]
-    inputs = [halves, flat, rows.start, edges, wp.array(ratios.reshape(-1, shape[2], 2), dtype=wp.vec2, device=device)]
-    wp.launch(sk.scatter_kernel, dim=(flat.shape[0], shape[2]), inputs=[*inputs, *outputs], device=device)
+    ratio = wp.array(ratios.reshape(-1, last - first, 2), dtype=wp.vec2, device=device)
+    inputs = [halves, flat, rows.start, rows.edges[first : last + 1], ratio]
+    wp.launch(sk.scatter_kernel, dim=ratio.shape, inputs=[*inputs, *outputs], device=device)
     return tuple(part.numpy().reshape(predicted.shape) for part in outputs)  # type: ignore[return-value]
+
+
+def _blended(cube: Cube, windows: Any, around: tuple[int, int], device: wp.Device) -> tuple[Cube, Cube]:
+    """Estimates from windows and their squared errors `[H, W, R]`, of what `_Rows.gathered` has `[H, W, R, 4]`."""
+    values: Any = wp.array(cube, dtype=wp.vec4, device=device)
+    sums, work, risk, near, blended = (wp.zeros(values.shape, dtype=wp.vec4, device=device) for _ in range(5))
+    for window in windows:
+        sk.window_sums(values, window, work, sums)
+        wp.launch(sk.estimate_kernel, dim=values.shape, inputs=[values, sums, risk], device=device)
+        sk.window_sums(risk, around, work, near)
+        wp.launch(sk.blend_kernel, dim=values.shape, inputs=[values, sums, near, blended], device=device)
+    wp.launch(sk.combine_kernel, dim=values.shape, inputs=[values, blended, risk], device=device)
+    sk.window_sums(risk, around, work, near)
+    found, own, mean = (array.numpy() for array in (blended, risk, near))
+    # One standard error more than the halves show. A window holds its own voxel: differences of float32 leave less.
+    bias = np.maximum(mean[..., 0] + np.sqrt(np.maximum(mean[..., 3], 0.0) * own[..., 2]), 0.0)
+    bias *= own[..., 2] / np.maximum(np.maximum(mean[..., 2], own[..., 2]), 1e-30)
+    return 0.5 * np.maximum(found[..., 0] + found[..., 1], 0.0), own[..., 1] + bias  # float32 may end below 0
