@@ -59,7 +59,7 @@ _FLOOR = 1e-3  # of the mean: forward-scattered light where none is predicted
 
 
 def tracing_time(scene: Scene, time: float | None, device: str | None = None) -> float:
-    """Seconds for the photons of a run of so many [s], by default 60, that `reconstruct` ends; half of them at least."""
+    """Seconds for the photons of a run of so many [s], by default 60, that `reconstruct` ends; at least half."""
     seconds = DEFAULT_TIME if time is None else check_real("time", time, "(0, 1e9] s")
     bins = scene.camera.height * scene.camera.width * scene.gate.bins
     return max(seconds - bins * _COST[pick_device(device).is_cuda], 0.5 * seconds)
@@ -88,8 +88,7 @@ def reconstruct(result: Result, *, device: str | None = None) -> Result:
     """
     from scipy.ndimage import distance_transform_edt
 
-    share = result.halves[0].photons / result.photons
-    scene, gate, shape, bins = result.scene, result.scene.gate, result.truth.depth.shape, result.scene.gate.bins
+    halves, scene, gate = result.halves, result.scene, result.scene.gate
     if not scene.has_straight_sight:
         raise ConfigError("reconstruct knows neither [surface] nor scan.mode = 'trajectory'", source=scene.source)
     if (focus := result.focus_distance) is not None:  # lens points matter where a point's image is half a pixel wide
@@ -97,38 +96,34 @@ def reconstruct(result: Result, *, device: str | None = None) -> Result:
         focus = focus if np.nanmax(blur, initial=0.0) > 0.25 * scene.camera.pixel_tangent else None
     chosen = pick_device(device)
     known = known_light(scene, focus, chosen)
-    every = _Rows(wp.zeros(result.truth.depth.size, dtype=int, device=chosen), np.arange(bins + 1))
-    ballistic = every.delayed(known.direct, known.span, (0, 1), _FINE).numpy().reshape(*shape, bins)
     # Scattered light of a pixel without a target is that of the nearest target.
     start = (result.true_path() / scene.medium.pulse_speed - gate.start) / gate.bin_width
     nearest = distance_transform_edt(np.isnan(start), return_distances=False, return_indices=True)
-    aligned = np.clip(np.nan_to_num(np.rint(start[tuple(nearest)])), 0, bins).astype(np.int32)
-    first = wp.array(aligned.ravel(), dtype=int, device=chosen)
-    rows = _Rows(first, _edges(-int(aligned.max()), bins - int(aligned.min())))
-    value: Any = wp.array(result.tally_value.ravel(), dtype=wp.float64, device=chosen)
-    found, squares = np.zeros((3, *shape, bins), np.float32), np.zeros((3, *shape, bins), np.float32)
+    aligned = np.clip(np.nan_to_num(np.rint(start[tuple(nearest)])), 0, gate.bins).astype(np.int64)
+    bins = _Rows(np.zeros_like(aligned), np.arange(gate.bins + 1), gate.bins, chosen)
+    rows = _Rows(aligned, _edges(-int(aligned.max()), gate.bins - int(aligned.min())), gate.bins, chosen)
+    plain = _Rows(np.zeros_like(aligned), _edges(0, gate.bins), gate.bins, chosen)
+    ballistic = bins.delayed(known.direct, known.span, (0, 1), _FINE).numpy().reshape(bins.shape)
+    share = halves[0].photons / result.photons
+    found = np.zeros((3, *bins.shape), np.float32)
 
-    def smooth(k: int) -> None:
-        halves, mean = sk.HalvesOfTallies(), (result.tallies[k] * result.tally_value[..., None]).astype(np.float32)
-        for name, cube in (("tallies", result.tallies), ("half", result.half)):
-            setattr(halves, name, wp.array(cube[k].reshape(-1, bins), dtype=wp.int64, device=chosen, copy=False))
-        halves.value, halves.share = value, share
-        if k == 0:
-            predicted = ballistic
-        elif k == 1:
-            predicted = _forward(known, ballistic, rows, every, halves)
-        else:
-            predicted = _backscatter(known.covered.numpy().reshape(mean.shape), mean)
+    def smooth(k: int) -> Cube:
+        parts = [(half.tallies[k] * half.tally_value[..., None]).astype(np.float32) for half in halves]
+        mean = np.float32(share) * parts[0] + np.float32(1.0 - share) * parts[1]
         if not mean.any():
-            return
+            return mean
+        if k == 1:
+            predicted = _forward(known, ballistic, rows, bins, mean)
+        else:
+            predicted = _backscatter(known.covered.numpy().reshape(mean.shape), mean) if k else ballistic
         predicted = predicted * np.float32(mean.sum(dtype=np.float64) / max(predicted.sum(dtype=np.float64), 1e-300))
         predicted += np.float32(k == 1) * _FLOOR * mean.mean()
-        own = rows if k < 2 else _Rows(every.start, _edges(0, bins))
-        found[k], squares[k] = _smoothed(halves, predicted, own, share, scattered=k > 0)
+        found[k], square = _smoothed(parts, mean, predicted, rows if k < 2 else plain, scattered=k > 0)
+        return square
 
     with ThreadPoolExecutor(1 if chosen.is_cuda else 2) as threads:
-        list(threads.map(smooth, (1, 0, 2)))
-    return replace(result, reconstruction=Reconstruction(histogram=found, error=np.sqrt(squares.sum(axis=0))))
+        squares = sum(threads.map(smooth, (1, 0, 2)))
+    return replace(result, reconstruction=Reconstruction(histogram=found, error=np.sqrt(squares)))
 
 
 def known_light(scene: Scene, focus: float | None, device: wp.Device) -> KnownLight:
@@ -239,32 +234,37 @@ def _edges(low: int, high: int) -> NDArray[np.int64]:
 class _Rows:
     """Rows of bins, which count from a bin of each pixel."""
 
-    def __init__(self, start: Any, edges: NDArray[np.int64]) -> None:
-        self.start, self.count = start, len(edges) - 1
-        self.edges: Any = wp.array(edges, dtype=int, device=start.device)
+    def __init__(self, start: NDArray[np.int64], edges: NDArray[np.int64], bins: int, device: wp.Device) -> None:
+        self.shape, self.device, self.count = (*start.shape, bins), device, len(edges) - 1
+        self._start, self._edges = start, edges
+        self._on_device: list[Any] = [wp.array(part.ravel(), dtype=int, device=device) for part in (start, edges)]
+        self.every: Any = wp.full(start.size, wp.vec2i(0, bins), dtype=wp.vec2i, device=device)
 
     def delayed(self, light: Any, span: Any, delay: tuple[int, int], per_bin: int, factor: float = 1.0, to: Any = None):
         """Light `[pixel, fine bin]` by a delay of so many fine bins, times a factor, `[pixel, row]`; added to `to`."""
-        device = light.device
-        to = wp.zeros((light.shape[0], self.count), dtype=float, device=device) if to is None else to
-        inputs = [light, span, wp.vec2i(*delay), per_bin, self.start, self.edges, factor, to]
-        wp.launch(sk.delay_kernel, dim=light.shape[0], inputs=inputs, device=device)
+        to = wp.zeros((light.shape[0], self.count), dtype=float, device=self.device) if to is None else to
+        inputs = [light, span, wp.vec2i(*delay), per_bin, *self._on_device, factor, to]
+        wp.launch(sk.delay_kernel, dim=light.shape[0], inputs=inputs, device=self.device)
         return to
 
-    def gathered(self, halves: Any, predicted: Any, scale: float) -> Cube:
-        """Halves, variance of their mean and prediction over `scale`, `[pixel, row, 4]`."""
-        gathered = wp.empty((predicted.shape[0], self.count), dtype=wp.vec4, device=predicted.device)
-        inputs = [halves, predicted, self.start, self.edges, scale, gathered]
-        wp.launch(sk.gather_kernel, dim=gathered.shape, inputs=inputs, device=predicted.device)
-        return gathered.numpy()
+    def summed(self, cube: Cube) -> Cube:
+        """Of bins `[H, W, T]` the sums in rows `[H, W, R]`."""
+        light: Any = wp.array(cube.reshape(-1, cube.shape[-1]), dtype=float, device=self.device)
+        return self.delayed(light, self.every, (0, 1), 1).numpy().reshape(*cube.shape[:2], -1)
+
+    def spread(self, values: Cube) -> Cube:
+        """Of rows `[H, W, R]` the value of each bin `[H, W, T]`."""
+        row_of = np.repeat(np.arange(self.count), np.diff(self._edges))
+        index = row_of[np.arange(self.shape[-1]) - self._start[..., None] - self._edges[0]]
+        return np.take_along_axis(values, index, axis=-1)
 
 
-def _forward(known: KnownLight, ballistic: Cube, rows: _Rows, every: _Rows, halves: Any) -> Cube:
+def _forward(known: KnownLight, ballistic: Cube, rows: _Rows, bins: _Rows, light: Cube) -> Cube:
     """Prediction of forward-scattered light from its tallies."""
     from scipy.ndimage import uniform_filter
     from scipy.optimize import nnls
 
-    device, (height, width, bins) = known.direct.device, ballistic.shape
+    device, flat = rows.device, (known.direct.shape[0], ballistic.shape[-1])
     terms: list[Any] = [(known.direct, known.span, delay, _FINE) for delay in _DELAYS]
     terms += [(known.even, known.span, delay, _FINE) for delay in _EVEN_DELAYS]
     lit = np.flatnonzero(ballistic.any(axis=(0, 1)))
@@ -274,13 +274,11 @@ def _forward(known: KnownLight, ballistic: Cube, rows: _Rows, every: _Rows, halv
         box = {"size": (2 * radius + 1, 2 * radius + 1, 1), "mode": "constant"}
         blurred = np.zeros_like(ballistic)
         blurred[..., first:last] = uniform_filter(uniform_filter(ballistic[..., first:last], **box), **box)
-        pixels: Any = wp.array(blurred.reshape(-1, bins), dtype=float, device=device)
+        pixels: Any = wp.array(blurred.reshape(flat), dtype=float, device=device)
         terms += [(pixels, span, delay, 1) for delay in _BLURRED_DELAYS]
     columns = np.stack([rows.delayed(*term).numpy().ravel() for term in terms])
     columns /= (sums := np.maximum(columns.sum(axis=1), 1e-30))[:, None]
-    ones = wp.ones((height * width, bins), dtype=float, device=device)
-    gathered = rows.gathered(halves, ones, 1.0)
-    light = (0.5 * (gathered[..., 0] + gathered[..., 1])).reshape(height, width, -1)
+    light = rows.summed(light)
     # Weights: the variance of light is about proportional to it.
     level = uniform_filter(light, (7, 7, 5), mode="constant").ravel()
     root = 1.0 / np.sqrt(level + 0.02 * level.max() + 1e-300)
@@ -289,10 +287,10 @@ def _forward(known: KnownLight, ballistic: Cube, rows: _Rows, every: _Rows, halv
     values, vectors = np.linalg.eigh((columns @ columns.T).astype(np.float64))
     scale = np.sqrt(np.maximum(values, np.finfo(np.float32).eps * values[-1]))[:, None]
     factors, _ = nnls(scale * vectors.T, (vectors.T / scale) @ (columns @ (light.ravel() * root)))
-    total = wp.zeros((height * width, bins), dtype=float, device=device)
+    total = wp.zeros(flat, dtype=float, device=device)
     for term, factor in zip(terms, factors / sums, strict=True):
         if factor > 0.0:
-            every.delayed(*term, factor=factor, to=total)
+            bins.delayed(*term, factor=factor, to=total)
     return total.numpy().reshape(ballistic.shape)
 
 
@@ -303,32 +301,24 @@ def _backscatter(covered: Cube, light: Cube) -> Cube:
     return sum(part * (total / np.maximum(pixels, 1e-6)) for part, total, pixels in parts)  # type: ignore[return-value]
 
 
-def _smoothed(halves: Any, predicted: Cube, rows: _Rows, share: float, scattered: bool) -> tuple[Cube, Cube]:
+def _smoothed(halves: list[Cube], mean: Cube, predicted: Cube, rows: _Rows, *, scattered: bool) -> tuple[Cube, Cube]:
     """Light of a component and its squared error `[H, W, T]`."""
-    device, pixels = rows.start.device, predicted.shape[:2]
-    flat: Any = wp.array(predicted.reshape(-1, predicted.shape[-1]), dtype=float, device=device)
-    scale = float(predicted.max()) or 1.0  # float32 holds the squares of what is near 1
-    gathered = rows.gathered(halves, flat, scale)
-    lit = np.flatnonzero(gathered[..., 3].any(axis=0))
-    first, last = (int(lit[0]), int(lit[-1]) + 1) if len(lit) else (0, 1)
-    values = gathered[:, first:last].reshape(*pixels, last - first, 4)
-    light, square = _blended(values, _WINDOWS, _AROUND, device)
+    scale, known = predicted.max() or np.float32(1.0), predicted > 0.0  # float32 holds the squares of what is near 1
+    first, second = (half / scale for half in halves)
+    noise = 0.25 * (first - second) ** 2
+    values = np.stack([rows.summed(cube * known) for cube in (first, second, noise, predicted / scale)], axis=-1)
+    light, square = _blended(values, _WINDOWS, _AROUND, rows.device)
     # Windows are chosen by the same noise, which loses rare light: rows get their own light back, with its noise.
     total = values.sum(axis=(0, 1), dtype=np.float64, keepdims=True)
-    traced = total[..., :2].sum(axis=(0, 1, 2)) @ [share, 1.0 - share]
     total /= max(float(total[..., 3].max()), 1e-30)
     total[..., 2] = 0.25 * (total[..., 0] - total[..., 1]) ** 2
-    reaches = _ROW_WINDOWS if scattered else _ROW_WINDOWS[:1]
-    whole, its = _blended(total.astype(np.float32), reaches, _ROW_AROUND, device)
-    kept = light.sum(axis=(0, 1), dtype=np.float64, keepdims=True) / (traced / max(float(whole.sum()), 1e-30))
-    light = light * np.divide(whole, kept, out=np.zeros_like(kept), where=kept > 0.0)
+    whole, its = _blended(total.astype(np.float32), _ROW_WINDOWS[: None if scattered else 1], _ROW_AROUND, rows.device)
+    kept = light.sum(axis=(0, 1), dtype=np.float64, keepdims=True)
+    kept *= scale * max(float(whole.sum()), 1e-30) / (mean * known).sum(dtype=np.float64)
+    light *= np.divide(whole, kept, out=np.zeros_like(kept), where=kept > 0.0)
     square += light**2 * np.divide(its, whole**2, out=np.zeros_like(kept), where=whole > 0.0)
-    ratios = np.stack([light, square], axis=-1) / np.maximum(values[..., 3:], 1e-30) ** [1, 2]
-    outputs: list[Any] = [wp.zeros_like(flat) for _ in range(2)]
-    ratio = wp.array(ratios.reshape(-1, last - first, 2), dtype=wp.vec2, device=device)
-    inputs = [halves, flat, rows.start, rows.edges[first : last + 1], ratio]
-    wp.launch(sk.scatter_kernel, dim=ratio.shape, inputs=[*inputs, *outputs], device=device)
-    return tuple(part.numpy().reshape(predicted.shape) for part in outputs)  # type: ignore[return-value]
+    ratio, its = (rows.spread(part / np.maximum(values[..., 3], 1e-30)) for part in (light, np.sqrt(square)))
+    return np.where(known, predicted * ratio, mean), np.where(known, (predicted * its) ** 2, noise * scale**2)
 
 
 def _blended(cube: Cube, windows: Any, around: tuple[int, int], device: wp.Device) -> tuple[Cube, Cube]:

@@ -5,14 +5,11 @@ from typing import Any
 import warp as wp
 
 __all__ = [
-    "HalvesOfTallies",
     "blend_kernel",
     "combine_kernel",
     "delay_kernel",
     "deposit_kernel",
     "estimate_kernel",
-    "gather_kernel",
-    "scatter_kernel",
     "window_sums",
 ]
 
@@ -154,74 +151,6 @@ def delay_kernel(
                 row += 1
         total += late
     rows[pixel, row] += float(scale * total)
-
-
-@wp.struct
-class HalvesOfTallies:
-    """Tallies of a component `[pixel, bin]`, those of one half of the photons, and its share in these."""
-
-    tallies: wp.array2d[wp.int64]
-    half: wp.array2d[wp.int64]
-    value: wp.array[wp.float64]  # of a tally, by pixel
-    share: wp.float64
-
-
-@wp.func
-def _half_values(halves: HalvesOfTallies, pixel: int, k: int, scale: float) -> wp.vec3:
-    """Light of both halves and the variance of their mean."""
-    unit = halves.value[pixel] / wp.float64(scale)
-    one = wp.float64(halves.half[pixel, k])
-    other = (wp.float64(halves.tallies[pixel, k]) - one) * unit / (wp.float64(1.0) - halves.share)
-    one *= unit / halves.share
-    return wp.vec3(float(one), float(other), float(wp.float64(0.25) * (one - other) * (one - other)))
-
-
-@wp.kernel(enable_backward=False)
-def gather_kernel(
-    halves: HalvesOfTallies,
-    predicted: wp.array2d[float],
-    start: wp.array[int],
-    edges: wp.array[int],
-    scale: float,
-    rows: wp.array2d[wp.vec4],
-):
-    """First half, second half, variance of their mean and prediction, where there is one, in rows of bins as
-    `delay_kernel` has, over `scale`. Launch: (pixel, row)."""
-    pixel, row = wp.tid()
-    total, bins = wp.vec4(), predicted.shape[1]
-    for k in range(wp.max(start[pixel] + edges[row], 0), wp.min(start[pixel] + edges[row + 1], bins)):
-        if predicted[pixel, k] > 0.0:
-            found = _half_values(halves, pixel, k, scale)
-            total += wp.vec4(found[0], found[1], found[2], predicted[pixel, k] / scale)
-    rows[pixel, row] = total
-
-
-@wp.kernel(enable_backward=False)
-def scatter_kernel(
-    halves: HalvesOfTallies,
-    predicted: wp.array2d[float],
-    start: wp.array[int],
-    edges: wp.array[int],
-    ratio: wp.array2d[wp.vec2],
-    light: wp.array2d[float],
-    square: wp.array2d[float],
-):
-    """Light of bins and its squared error from rows' ratios to the prediction; as traced where there is none.
-    Launch: (pixel, row)."""
-    pixel, row = wp.tid()
-    bins = predicted.shape[1]
-    first = wp.where(row == 0, 0, wp.max(start[pixel] + edges[row], 0))
-    last = wp.where(row == ratio.shape[1] - 1, bins, wp.min(start[pixel] + edges[row + 1], bins))
-    for k in range(first, last):
-        known = predicted[pixel, k]
-        if known > 0.0:
-            light[pixel, k] = known * ratio[pixel, row][0]
-            square[pixel, k] = known * known * ratio[pixel, row][1]
-        else:
-            traced = wp.float64(halves.tallies[pixel, k]) * halves.value[pixel]
-            found = _half_values(halves, pixel, k, 1.0)
-            light[pixel, k] = float(traced)
-            square[pixel, k] = found[2]
 
 
 @wp.func
