@@ -69,6 +69,7 @@ class KnownLight(NamedTuple):
     """What truth rays know, arrays of the device by pixel: light up to a factor, in fine bins."""
 
     direct: Any  # ballistic light
+    gentle: Any  # the same where water only absorbs: light scattered forward is not lost
     even: Any  # surfaces in even light
     span: Any  # first and last fine bin with light
     covered: Any  # the part of a pixel whose surface has light of a bin or of an earlier one, by bin
@@ -130,9 +131,9 @@ def known_light(scene: Scene, focus: float | None, device: wp.Device) -> KnownLi
     """From truth rays, also of a lens with this focus [m]."""
     camera, gate = scene.camera, scene.gate
     model, pixels = build_model(scene, device, build_mesh(scene), camera=False), camera.height * camera.width
-    light = (wp.zeros((pixels, gate.bins * _FINE), dtype=float, device=device) for _ in range(2))
+    light = wp.zeros((3, pixels, gate.bins * _FINE), dtype=float, device=device)
     covered = wp.zeros((pixels, gate.bins), dtype=float, device=device)
-    known = KnownLight(*light, wp.zeros(pixels, dtype=wp.vec2i, device=device), covered)
+    known = KnownLight(*(light[k] for k in range(3)), wp.zeros(pixels, dtype=wp.vec2i, device=device), covered)
     radius = 0.0 if camera.pinhole or camera.port is not None or focus is None else camera.aperture_radius
     places, lens = (np.array(part)[:, None, None] for part in zip(*_places(radius), strict=True))
     height = max(1, _RAYS // (len(places) * camera.width))
@@ -146,9 +147,9 @@ def known_light(scene: Scene, focus: float | None, device: wp.Device) -> KnownLi
         shape = (len(places), corners.shape[0] * camera.width)
         inputs = [
             wp.array(part.reshape(*shape, *part.shape[3:]), dtype=dtype, device=device)
-            for part, dtype in zip(rays, (wp.float64, wp.vec2d, wp.vec2), strict=True)
+            for part, dtype in zip(rays, (wp.float64, wp.vec2d, wp.vec3), strict=True)
         ]
-        outputs = [first * camera.width, *known]
+        outputs = [first * camera.width, light, known.span, known.covered]
         wp.launch(sk.deposit_kernel, dim=shape[1], inputs=inputs, outputs=outputs, device=device)
 
     starts = range(0, camera.height, height) if model.mesh is not None else ()
@@ -180,8 +181,9 @@ def _trace(scene: Scene, model: sk.Model, places: Any, lens: Any, focus: float |
     free = trace(begin, direction)[0]
     lit = ~(free < way * (1.0 - 1e-4) - 1e-3) * _footprint(scene, direction)
     lit *= np.maximum(-(direction * normal).sum(axis=-1), 0.0) / way**2
-    passed = np.exp(-scene.optical_depth(start, point) - scene.optical_depth(begin, point))
-    even = reflectance * passed / slant[..., 0] ** 4
+    depth = scene.optical_depth(start, point) + scene.optical_depth(begin, point)
+    even = reflectance * np.exp(-depth) / slant[..., 0] ** 4
+    gentle = even * lit * np.exp(depth * (scene.medium.scattering / max(scene.medium.extinction, 1e-30)))
     fine = _FINE / (scene.medium.pulse_speed * gate.bin_width)
     time = (path + along + lines.delay) * fine - gate.start / gate.bin_width * _FINE
     # Each ray stands for the part of the surface around it, whose times differ along both axes of the image.
@@ -193,7 +195,7 @@ def _trace(scene: Scene, model: sk.Model, places: Any, lens: Any, focus: float |
         slopes.append(along * (moved * (lines.direction + direction)).sum(axis=-1) * fine)
     wide, narrow = np.maximum(*np.abs(slopes)), np.minimum(*np.abs(slopes))
     time[~np.isfinite(even + lit + wide)] = np.nan
-    return time, np.stack([np.maximum(wide, 1e-3), narrow], axis=-1), np.stack([even * lit, even], axis=-1)
+    return time, np.stack([np.maximum(wide, 1e-3), narrow], axis=-1), np.stack([even * lit, gentle, even], axis=-1)
 
 
 def _places(radius: float) -> Iterator[tuple[NDArray[Any], NDArray[Any]]]:
@@ -266,6 +268,7 @@ def _forward(known: KnownLight, ballistic: Cube, rows: _Rows, bins: _Rows, light
 
     device, flat = rows.device, (known.direct.shape[0], ballistic.shape[-1])
     terms: list[Any] = [(known.direct, known.span, delay, _FINE) for delay in _DELAYS]
+    terms += [(known.gentle, known.span, delay, _FINE) for delay in _DELAYS]
     terms += [(known.even, known.span, delay, _FINE) for delay in _EVEN_DELAYS]
     lit = np.flatnonzero(ballistic.any(axis=(0, 1)))
     first, last = (lit[0], lit[-1] + 1) if len(lit) else (0, 0)

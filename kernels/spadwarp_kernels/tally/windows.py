@@ -78,21 +78,20 @@ def window_sums(values: wp.array, radius: tuple[int, int], work: wp.array, sums:
 def deposit_kernel(
     time: wp.array2d[wp.float64],
     width: wp.array2d[wp.vec2d],
-    light: wp.array2d[wp.vec2],
+    light: wp.array2d[wp.vec3],
     first: int,
-    direct: wp.array2d[float],
-    even: wp.array2d[float],
+    known: wp.array3d[float],
     span: wp.array[wp.vec2i],
     covered: wp.array2d[float],
 ):
-    """Rays `[ray, pixel]` into fine bins of pixels from `first` on: two kinds of light and the part of rays that met a
+    """Rays `[ray, pixel]` into fine bins of pixels from `first` on: three kinds of light, the part of rays that met a
     surface before a bin ends. Launch: (pixel).
 
     `time`: middle [fine bin], NaN for none; `width`: along both axes of a pixel, over which light spreads; `span`: fine
     bins with light.
     """
     i = wp.tid()
-    pixel, rays, count = first + i, time.shape[0], direct.shape[1]
+    pixel, rays, count = first + i, time.shape[0], known.shape[2]
     per_bin, low, high = count // covered.shape[1], int(count), int(0)
     for ray in range(rays):
         middle, size = time[ray, i], width[ray, i]
@@ -110,8 +109,8 @@ def deposit_kernel(
                     risen = wp.clamp(after - start, wp.float64(0.0), wp.float64(1.0))
                     part = risen - wp.clamp(after - stop, wp.float64(0.0), wp.float64(1.0))
                     share = float(wp.float64(0.5) * part / size[0])
-                    direct[pixel, k] += share * light[ray, i][0]
-                    even[pixel, k] += share * light[ray, i][1]
+                    for kind in range(known.shape[0]):
+                        known[kind, pixel, k] += share * light[ray, i][kind]
                 if begin < count and stop > wp.float64(0.0):
                     low, high = wp.min(low, begin), wp.max(high, wp.min(last, count))
     for k in range(1, covered.shape[1]):
