@@ -52,8 +52,8 @@ _BLURS = (1, 3, 8, 20)  # of two boxes [pixels]
 _ROW = 8  # a row of bins is as wide as this part of its distance from the true path
 # Radii of the windows, in pixels and rows, and of the one over which their errors are averaged.
 _WINDOWS = ((0, 0), (1, 0), (2, 0), (4, 0), (8, 0), (16, 0), (32, 0), (4, 1), (8, 2), (32, 4))
-_AROUND = (3, 1)
-_ROW_WINDOWS, _ROW_AROUND = tuple((0, reach) for reach in (0, 1, 2, 4, 8)), (0, 4)  # of sums over all pixels
+_AROUND = ((3, 1), (16, 1))
+_ROW_WINDOWS, _ROW_AROUND = tuple((0, reach) for reach in (0, 1, 2, 4, 8)), ((0, 4),)  # of sums over all pixels
 _COST = 1e-6, 5e-8  # seconds that a bin takes on two cores, on a GPU
 _FLOOR = 1e-3  # of the mean: forward-scattered light where none is predicted
 
@@ -183,7 +183,7 @@ def _trace(scene: Scene, model: sk.Model, places: Any, lens: Any, focus: float |
     lit *= np.maximum(-(direction * normal).sum(axis=-1), 0.0) / way**2
     depth = scene.optical_depth(start, point) + scene.optical_depth(begin, point)
     even = reflectance * np.exp(-depth) / slant[..., 0] ** 4
-    gentle = even * lit * np.exp(depth * (scene.medium.scattering / max(scene.medium.extinction, 1e-30)))
+    gentle = even * lit * np.exp(depth * scene.medium.range.albedo)
     fine = _FINE / (scene.medium.pulse_speed * gate.bin_width)
     time = (path + along + lines.delay) * fine - gate.start / gate.bin_width * _FINE
     # Each ray stands for the part of the surface around it, whose times differ along both axes of the image.
@@ -324,19 +324,22 @@ def _smoothed(halves: list[Cube], mean: Cube, predicted: Cube, rows: _Rows, *, s
     return np.where(known, predicted * ratio, mean), np.where(known, (predicted * its) ** 2, noise * scale**2)
 
 
-def _blended(cube: Cube, windows: Any, around: tuple[int, int], device: wp.Device) -> tuple[Cube, Cube]:
+def _blended(cube: Cube, windows: Any, arounds: Any, device: wp.Device) -> tuple[Cube, Cube]:
     """Estimates from windows and their squared errors `[H, W, R]`, of what `_Rows.gathered` has `[H, W, R, 4]`."""
     values: Any = wp.array(cube, dtype=wp.vec4, device=device)
     sums, work, risk, near, blended = (wp.zeros(values.shape, dtype=wp.vec4, device=device) for _ in range(5))
     for window in windows:
         sk.window_sums(values, window, work, sums)
         wp.launch(sk.estimate_kernel, dim=values.shape, inputs=[values, sums, risk], device=device)
-        sk.window_sums(risk, around, work, near)
+        sk.window_sums(risk, arounds[0], work, near)
         wp.launch(sk.blend_kernel, dim=values.shape, inputs=[values, sums, near, blended], device=device)
     wp.launch(sk.combine_kernel, dim=values.shape, inputs=[values, blended, risk], device=device)
-    sk.window_sums(risk, around, work, near)
-    found, own, mean = (array.numpy() for array in (blended, risk, near))
-    # One standard error more than the halves show. A window holds its own voxel: differences of float32 leave less.
-    bias = np.maximum(mean[..., 0] + np.sqrt(np.maximum(mean[..., 3], 0.0) * own[..., 2]), 0.0)
-    bias *= own[..., 2] / np.maximum(np.maximum(mean[..., 2], own[..., 2]), 1e-30)
+    found, own = blended.numpy(), risk.numpy()
+    bias = np.zeros_like(own[..., 0])
+    for reach in arounds:
+        sk.window_sums(risk, reach, work, near)
+        mean = near.numpy()
+        # One standard error more than the halves show. A window holds its own voxel: differences of float32 leave less.
+        more = np.maximum(mean[..., 0] + np.sqrt(np.maximum(mean[..., 3], 0.0) * own[..., 2]), 0.0)
+        bias = np.maximum(bias, more * own[..., 2] / np.maximum(np.maximum(mean[..., 2], own[..., 2]), 1e-30))
     return 0.5 * np.maximum(found[..., 0] + found[..., 1], 0.0), own[..., 1] + bias  # float32 may end below 0
