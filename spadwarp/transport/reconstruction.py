@@ -69,7 +69,7 @@ class KnownLight(NamedTuple):
     """What truth rays know, arrays of the device by pixel: light up to a factor, in fine bins."""
 
     direct: Any  # ballistic light
-    gentle: Any  # the same where water only absorbs: light scattered forward is not lost
+    scattered: Any  # the same times the scattering on its way, as light that scattered forward has
     even: Any  # surfaces in even light
     span: Any  # first and last fine bin with light
     covered: Any  # the part of a pixel whose surface has light of a bin or of an earlier one, by bin
@@ -183,7 +183,7 @@ def _trace(scene: Scene, model: sk.Model, places: Any, lens: Any, focus: float |
     lit *= np.maximum(-(direction * normal).sum(axis=-1), 0.0) / way**2
     depth = scene.optical_depth(start, point) + scene.optical_depth(begin, point)
     even = reflectance * np.exp(-depth) / slant[..., 0] ** 4
-    gentle = even * lit * np.exp(depth * scene.medium.range.albedo)
+    scattered = even * lit * np.expm1(depth * scene.medium.range.albedo)
     fine = _FINE / (scene.medium.pulse_speed * gate.bin_width)
     time = (path + along + lines.delay) * fine - gate.start / gate.bin_width * _FINE
     # Each ray stands for the part of the surface around it, whose times differ along both axes of the image.
@@ -195,7 +195,7 @@ def _trace(scene: Scene, model: sk.Model, places: Any, lens: Any, focus: float |
         slopes.append(along * (moved * (lines.direction + direction)).sum(axis=-1) * fine)
     wide, narrow = np.maximum(*np.abs(slopes)), np.minimum(*np.abs(slopes))
     time[~np.isfinite(even + lit + wide)] = np.nan
-    return time, np.stack([np.maximum(wide, 1e-3), narrow], axis=-1), np.stack([even * lit, gentle, even], axis=-1)
+    return time, np.stack([np.maximum(wide, 1e-3), narrow], axis=-1), np.stack([even * lit, scattered, even], axis=-1)
 
 
 def _places(radius: float) -> Iterator[tuple[NDArray[Any], NDArray[Any]]]:
@@ -268,7 +268,7 @@ def _forward(known: KnownLight, ballistic: Cube, rows: _Rows, bins: _Rows, light
 
     device, flat = rows.device, (known.direct.shape[0], ballistic.shape[-1])
     terms: list[Any] = [(known.direct, known.span, delay, _FINE) for delay in _DELAYS]
-    terms += [(known.gentle, known.span, delay, _FINE) for delay in _DELAYS]
+    terms += [(known.scattered, known.span, delay, _FINE) for delay in _DELAYS]
     terms += [(known.even, known.span, delay, _FINE) for delay in _EVEN_DELAYS]
     lit = np.flatnonzero(ballistic.any(axis=(0, 1)))
     first, last = (lit[0], lit[-1] + 1) if len(lit) else (0, 0)
