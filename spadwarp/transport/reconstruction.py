@@ -12,8 +12,8 @@
 
 from __future__ import annotations
 
+import bisect
 import math
-from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 from typing import Any, NamedTuple
@@ -78,7 +78,7 @@ class KnownLight(NamedTuple):
 def reconstruct(result: Result, *, device: str | None = None) -> Result:
     """The result with `Result.reconstruction`: its light without most of its noise; tallies stay as they are.
 
-    Of the histogram by component; derivatives and polarised channels are left as they are. Takes about 100 bytes a bin.
+    Of the histogram by component; derivatives and polarised channels are left as they are. Takes about 300 bytes a bin.
 
     Args:
         result: With two halves, `Result.halves`, and a scene whose files are still there.
@@ -135,7 +135,7 @@ def known_light(scene: Scene, focus: float | None, device: wp.Device) -> KnownLi
     covered = wp.zeros((pixels, gate.bins), dtype=float, device=device)
     known = KnownLight(*(light[k] for k in range(3)), wp.zeros(pixels, dtype=wp.vec2i, device=device), covered)
     radius = 0.0 if camera.pinhole or camera.port is not None or focus is None else camera.aperture_radius
-    places, lens = (np.array(part)[:, None, None] for part in zip(*_places(radius), strict=True))
+    places, lens = (part[:, None, None] for part in _places(radius))
     height = max(1, _RAYS // (len(places) * camera.width))
 
     def add(first: int) -> None:
@@ -198,17 +198,15 @@ def _trace(scene: Scene, model: sk.Model, places: Any, lens: Any, focus: float |
     return time, np.stack([np.maximum(wide, 1e-3), narrow], axis=-1), np.stack([even * lit, scattered, even], axis=-1)
 
 
-def _places(radius: float) -> Iterator[tuple[NDArray[Any], NDArray[Any]]]:
-    """Places within a pixel, and points of a lens of this radius [m] that is not behind a port [m]."""
+def _places(radius: float) -> tuple[NDArray[Any], NDArray[Any]]:
+    """Places within a pixel, and points of a lens of this radius [m] that is not behind a port [m]; `[ray, 2 or 3]`."""
     side = len(_ORDER)
-    for k in range(side**2 * (_LENS if radius else 1)):
-        cell = np.array([k % side, k // side % side])
-        u, v = (k + 0.5) * _STEPS % 1.0
-        r, angle = radius * math.sqrt(u), 2.0 * math.pi * v
-        yield (
-            (cell + (_ORDER[cell[::-1]] + 0.5) / side) / side,
-            np.array([r * math.cos(angle), r * math.sin(angle), 0.0]),
-        )
+    k = np.arange(side**2 * (_LENS if radius else 1))
+    cell = np.stack([k % side, k // side % side], axis=-1)
+    u, v = ((k[:, None] + 0.5) * _STEPS % 1.0).T
+    r, angle = radius * np.sqrt(u), 2.0 * math.pi * v
+    lens = np.stack([r * np.cos(angle), r * np.sin(angle), np.zeros_like(r)], axis=-1)
+    return (cell + (_ORDER[cell[:, ::-1]] + 0.5) / side) / side, lens
 
 
 def _footprint(scene: Scene, direction: NDArray[np.float64]) -> NDArray[np.float64]:
@@ -227,10 +225,8 @@ def _edges(low: int, high: int) -> NDArray[np.int64]:
     ends = [0]
     while ends[-1] < max(-low, high):
         ends.append(ends[-1] + max(1, ends[-1] // _ROW))
-    sides = np.array(ends)
-    return np.concatenate(
-        [-sides[1 : np.searchsorted(sides, -low) + 1][::-1], sides[: np.searchsorted(sides, high) + 1]]
-    )
+    before, after = (ends[: bisect.bisect_left(ends, limit) + 1] for limit in (-low, high))
+    return np.array([*(-end for end in before[:0:-1]), *after])
 
 
 class _Rows:
@@ -317,7 +313,7 @@ def _smoothed(halves: list[Cube], mean: Cube, predicted: Cube, rows: _Rows, *, s
     total[..., 2] = 0.25 * (total[..., 0] - total[..., 1]) ** 2
     whole, its = _blended(total.astype(np.float32), _ROW_WINDOWS[: None if scattered else 1], _ROW_AROUND, rows.device)
     kept = light.sum(axis=(0, 1), dtype=np.float64, keepdims=True)
-    kept *= scale * max(float(whole.sum()), 1e-30) / (mean * known).sum(dtype=np.float64)
+    kept *= scale * max(float(whole.sum()), 1e-30) / max((mean * known).sum(dtype=np.float64), 1e-300)
     light *= np.divide(whole, kept, out=np.zeros_like(kept), where=kept > 0.0)
     square += light**2 * np.divide(its, whole**2, out=np.zeros_like(kept), where=whole > 0.0)
     ratio, its = (rows.spread(part / np.maximum(values[..., 3], 1e-30)) for part in (light, np.sqrt(square)))
