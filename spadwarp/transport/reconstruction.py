@@ -53,7 +53,7 @@ _ROW = 8  # a row of bins is as wide as this part of its distance from the true 
 # Radii of the windows, in pixels and rows, and of the one over which their errors are averaged.
 _WINDOWS = ((0, 0), (1, 0), (2, 0), (4, 0), (8, 0), (16, 0), (32, 0), (4, 1), (8, 2), (32, 4))
 _AROUND = ((3, 1), (16, 1))
-_ROW_WINDOWS, _ROW_AROUND = tuple((0, reach) for reach in (0, 1, 2, 4, 8)), ((0, 4),)  # of sums over all pixels
+_ROW_WINDOWS, _ROW_AROUND = tuple((0, reach) for reach in (0, 1, 2, 4, 8, 16)), ((0, 8),)  # of sums over all pixels
 _COST = 1e-6, 5e-8  # seconds that a bin takes on two cores, on a GPU
 _FLOOR = 1e-3  # of the mean: forward-scattered light where none is predicted
 
