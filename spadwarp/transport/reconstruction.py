@@ -133,7 +133,7 @@ def known_light(scene: Scene, focus: float | None, device: wp.Device) -> KnownLi
     model, pixels = build_model(scene, device, build_mesh(scene), camera=False), camera.height * camera.width
     light = wp.zeros((3, pixels, gate.bins * _FINE), dtype=float, device=device)
     covered = wp.zeros((pixels, gate.bins), dtype=float, device=device)
-    known = KnownLight(*(light[k] for k in range(3)), wp.zeros(pixels, dtype=wp.vec2i, device=device), covered)
+    known = KnownLight(light[0], light[1], light[2], wp.zeros(pixels, dtype=wp.vec2i, device=device), covered)
     radius = 0.0 if camera.pinhole or camera.port is not None or focus is None else camera.aperture_radius
     places, lens = (part[:, None, None] for part in _places(radius))
     height = max(1, _RAYS // (len(places) * camera.width))
@@ -145,7 +145,7 @@ def known_light(scene: Scene, focus: float | None, device: wp.Device) -> KnownLi
         )
         rays = _trace(scene, model, corners + places, lens, focus)
         shape = (len(places), corners.shape[0] * camera.width)
-        inputs = [
+        inputs: list[Any] = [
             wp.array(part.reshape(*shape, *part.shape[3:]), dtype=dtype, device=device)
             for part, dtype in zip(rays, (wp.float64, wp.vec2d, wp.vec3), strict=True)
         ]
@@ -245,12 +245,12 @@ class _Rows:
         wp.launch(sk.delay_kernel, dim=light.shape[0], inputs=inputs, device=self.device)
         return to
 
-    def summed(self, cube: Cube) -> Cube:
+    def summed(self, cube: NDArray[Any]) -> Cube:
         """Of bins `[H, W, T]` the sums in rows `[H, W, R]`."""
         light: Any = wp.array(cube.reshape(-1, cube.shape[-1]), dtype=float, device=self.device)
         return self.delayed(light, self.every, (0, 1), 1).numpy().reshape(*cube.shape[:2], -1)
 
-    def spread(self, values: Cube) -> Cube:
+    def spread(self, values: NDArray[Any]) -> NDArray[Any]:
         """Of rows `[H, W, R]` the value of each bin `[H, W, T]`."""
         row_of = np.repeat(np.arange(self.count), np.diff(self._edges))
         index = row_of[np.arange(self.shape[-1]) - self._start[..., None] - self._edges[0]]
@@ -287,9 +287,9 @@ def _forward(known: KnownLight, ballistic: Cube, rows: _Rows, bins: _Rows, light
     scale = np.sqrt(np.maximum(values, np.finfo(np.float32).eps * values[-1]))[:, None]
     factors, _ = nnls(scale * vectors.T, (vectors.T / scale) @ (columns @ (light.ravel() * root)))
     total = wp.zeros(flat, dtype=float, device=device)
-    for term, factor in zip(terms, factors / sums, strict=True):
+    for (pixels, span, delay, per_bin), factor in zip(terms, factors / sums, strict=True):
         if factor > 0.0:
-            bins.delayed(*term, factor=factor, to=total)
+            bins.delayed(pixels, span, delay, per_bin, factor, total)
     return total.numpy().reshape(ballistic.shape)
 
 
