@@ -99,7 +99,8 @@ def typical_pixels(scene: Scene, device: str | None = None) -> Mask:
     without a photon does not choose pixels by their noise. bool `[H, W]`."""
     truth = truth_maps(scene, device=device)
     if scene.surface is None:
-        light = known_light(scene, None, pick_device(device))[0].sum(axis=-1, dtype=np.float64)
+        light = known_light(scene, None, pick_device(device)).direct.numpy().sum(axis=-1, dtype=np.float64)
+        light = light.reshape(truth.depth.shape)
     else:
         view, normal = pixel_directions(scene.camera).reshape(-1, 3), truth.normal.reshape(-1, 3)
         surface: Any = {"distance": truth.range.ravel(), "normal": normal, "reflectance": truth.reflectance.ravel()}

@@ -64,7 +64,8 @@ def simulate(
         photons (N|auto): Photons to emit, such as 2e9. auto: until the noise of the simulation is small beside that of
             a frame's photons in the median pixel of the target, a tenth of its variance, or until --relative-error or
             --time; the default where the scene gives no number.
-        time (SECONDS): Of auto at most, without loading kernels; by default 60. It asks for auto.
+        time (SECONDS): Of auto at most, reconstruction included, without loading kernels; by default 60. It asks for
+            auto.
         seed: Key of the random numbers. By default the scene's.
         threads: CPU threads; by default one for each core.
         records: Also write the terminal state of every photon: records.h5.
@@ -138,6 +139,10 @@ def simulate(
     names = _parameters(read, derivatives, earlier)
     _prepare(read, devices, engine, names)
     _prepare_directory(out, read, earlier, scene, derivatives=len(names), records=records, checkpoint=checkpoint > 0)
+    device = None if devices is None or engine else spadwarp.device.pick_devices(devices)[0].alias
+    automatic = reconstruct is None and read.transport.photons == "auto" and read.has_straight_sight
+    if read.transport.photons == "auto" and (reconstruct or automatic):
+        time = spadwarp.transport.tracing_time(read, time, device)
     # Ray reports the loss of a worker on stdout, which is for results.
     with redirect_stdout(sys.stderr), _while_pictures_load(progress(), read) as report:
         result = spadwarp.simulate(
@@ -158,8 +163,6 @@ def simulate(
                 checkpoint_every=checkpoint,
             ),
         )
-    device = None if devices is None or engine else spadwarp.device.pick_devices(devices)[0].alias
-    automatic = reconstruct is None and read.transport.photons == "auto" and read.has_straight_sight
     if (reconstruct or automatic) and result.batches > 1:
         note("the light is reconstructed")
         result = spadwarp.reconstruct(result, device=device)

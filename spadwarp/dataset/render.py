@@ -21,7 +21,7 @@ from spadwarp.result import Result, Truth, analyser_channel, degree_of_polarisat
 from spadwarp.scene import Scene
 from spadwarp.scene.camera import pixel_directions
 from spadwarp.scene.sight import depth_from_time, depth_per_time, gate_deviation, lines_of_sight
-from spadwarp.transport import RunOptions, reconstruct, simulate, truth_maps
+from spadwarp.transport import RunOptions, reconstruct, simulate, tracing_time, truth_maps
 from spadwarp.values import ConfigError, SpadwarpWarning, path_from_time
 
 PROFILE_BINS = 64
@@ -201,23 +201,23 @@ def _background(scene: Scene, draw: SceneDraw, maps: dict[str, Floats]) -> tuple
 def render_transport(plan: Plan, draw: SceneDraw, *, device: str | None, threads: int | None) -> RenderedScene:
     """Traces the scene's photons, exposes the camera for each frame and finds its depth."""
     assert draw.photons is not None
-    scene = draw.scene
+    scene, chosen = draw.scene, plan.recipe.monte_carlo
+    automatic = draw.photons == "auto" and chosen.channel == "I" and scene.has_straight_sight
+    rebuilt = automatic if chosen.reconstruct is None else chosen.reconstruct
     options: dict[str, Any] = {"seed": draw.seed, "device": device, "run": RunOptions(threads=threads)}
     if draw.photons == "auto":
         # The pulses of the frame, beside whose noise that of the simulation shall be small, follow from the light.
         pilot = simulate(scene, photons=_PILOT_PHOTONS, **options)
         if (found := _returned(pilot)).any():
             scene = with_exposure(scene, draw, found[found > 0], most=_MOST_COUNTED_PULSES)
-        options["time"] = plan.recipe.monte_carlo.time
+        options["time"] = tracing_time(scene, chosen.time, device) if rebuilt else chosen.time
     result = simulate(scene, photons=draw.photons, **options)
     photons = result.photons
     if result.partial:
         raise KeyboardInterrupt
     polarisation = degree_of_polarisation(result).astype(np.float16) if result.scene.camera.channels else None
-    result = analyser_channel(result, plan.recipe.monte_carlo.channel)
-    chosen = plan.recipe.monte_carlo
-    automatic = draw.photons == "auto" and chosen.channel == "I" and scene.has_straight_sight
-    if (automatic if chosen.reconstruct is None else chosen.reconstruct) and result.batches > 1:
+    result = analyser_channel(result, chosen.channel)
+    if rebuilt and result.batches > 1:
         result = reconstruct(result, device=device)
     scale = scene.laser.photons_per_pulse * scene.detections_per_photon
     water = result.expected("backscatter")

@@ -251,7 +251,10 @@ class Result(Shown, ResultHead, Tallies):
 
     @property
     def intensity(self) -> Floats:
-        """Expected fraction of emitted photons that arrive in each pixel within the gate: float64 `[H, W]`."""
+        """Expected fraction of emitted photons that arrive in each pixel within the gate, of the reconstruction where
+        there is one: float64 `[H, W]`."""
+        if self.reconstruction is not None:
+            return self.reconstruction.histogram.sum(axis=(0, 3), dtype=np.float64)
         return self.tallies.sum(axis=(0, 3), dtype=np.float64) * self.tally_value
 
     def _fraction(self, tallies: NDArray[np.int64]) -> Floats:

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import bisect
-import itertools
 import math
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import suppress
@@ -513,25 +511,26 @@ class Medium(PhaseLaw, Water):
         extinction, scattering, absorption, albedo = zip(*extremes, strict=True)
         return WaterRange(max(extinction), max(scattering), max(0.0, min(absorption)), max(albedo), tuple(g))
 
-    def optical_depth(self, begin: Sequence[float], end: Sequence[float]) -> float:
-        """∫c ds along the straight line between two points of the world [m]."""
-        length = math.dist(begin, end)
+    def optical_depth(self, begin: ArrayLike, end: ArrayLike) -> Any:
+        """∫c ds along straight lines between points of the world `[..., 3]` [m]."""
         if self.grid is not None:
-            return float(grid_cells(self).optical_depths(begin, end, self.extinction))
-        if not self.layers or length == 0.0:
+            return grid_cells(self).optical_depths(begin, end, self.extinction)[()]
+        first, last = np.asarray(begin, np.float64), np.asarray(end, np.float64)
+        length = np.linalg.norm(last - first, axis=-1)
+        if not self.layers:
             return self.extinction * length
-        scale = math.hypot(*self.layer_axis)
-        first, last = sorted(
-            sum(a * x for a, x in zip(self.layer_axis, point, strict=True)) / scale for point in (begin, end)
+        axis = np.array(self.layer_axis) / math.hypot(*self.layer_axis)
+        heights = np.array(np.broadcast_arrays(first @ axis, last @ axis))
+        starts, extinction = (
+            [layer.start for layer in self.layers],
+            np.array([water.extinction for water in self.waters]),
         )
-        edges = [-math.inf, *(layer.start for layer in self.layers), math.inf]
-        if first == last:
-            return length * self.waters[bisect.bisect_right(edges, first) - 1].extinction
-        parts = (
-            water.extinction * max(0.0, min(high, last) - max(low, first))
-            for water, (low, high) in zip(self.waters, itertools.pairwise(edges), strict=True)
-        )
-        return length / (last - first) * math.fsum(parts)
+        here = extinction[np.searchsorted(starts, heights[0], side="right")]
+        across = extinction[0] * (heights[1] - heights[0])
+        for start, more in zip(starts, np.diff(extinction), strict=True):
+            across += more * np.diff(np.maximum(heights - start, 0.0), axis=0)[0]
+        way = heights[1] - heights[0]
+        return length * np.divide(across, way, out=np.broadcast_to(here, way.shape).copy(), where=way != 0.0)[()]
 
     def to_dict(self) -> dict[str, Any]:
         """The fields that make an equal section again: of the coefficients the given ones, of the indices too."""

@@ -7,7 +7,7 @@ import csv
 import io
 import math
 import os
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from dataclasses import dataclass
 from importlib.resources import files
 from pathlib import Path
@@ -307,10 +307,10 @@ class Scene(Shown, Document):
         detector's frame."""
         return self.analytic.pulses_per_depth_frame or self.detector.pulses_per_frame
 
-    def optical_depth(self, begin: Sequence[float], end: Sequence[float]) -> float:
-        """∫c ds along the straight line between two points of the camera frame [m]."""
+    def optical_depth(self, begin: ArrayLike, end: ArrayLike) -> Any:
+        """∫c ds along straight lines between points of the camera frame `[..., 3]` [m]."""
         if self.medium.varies and self.camera.is_posed:
-            begin, end = to_world(self.camera, [begin, end]).tolist()
+            begin, end = (to_world(self.camera, point) for point in (begin, end))
         return self.medium.optical_depth(begin, end)
 
     @property

@@ -3,8 +3,8 @@
 1. Truth rays within each pixel, with the laser's footprint, shadows, cosines and attenuation, give the ballistic light
    up to a factor. Light that scattered forward on its way is this light later and blurred, or lights the surfaces
    evenly; backscatter ends at the first surface. Non-negative least squares of such terms predict each component.
-2. The ratio of the tallies to the prediction is smooth. It is averaged over windows of pixels and bins, the bins
-   counted from the pixel's own true path, and the windows are blended by their squared errors.
+2. The ratio of the tallies to the prediction is smooth. It is averaged over windows of pixels and rows of bins, counted
+   from the pixel's own true path and wider far from it, and the windows are blended by their squared errors.
 3. These come from two independent halves of the photons: the product of the halves' residuals has the squared bias as
    its expectation, and the squares of their differences the variance (dual buffers: Rousselle et al. 2012; regression
    on noise-free features: Bitterli et al. 2016; kernels in time: Jarabo et al. 2014).
@@ -12,11 +12,11 @@
 
 from __future__ import annotations
 
+import bisect
 import math
-from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 import warp as wp
@@ -25,14 +25,15 @@ from numpy.typing import NDArray
 import spadwarp_kernels as sk
 from spadwarp.device import pick_device
 from spadwarp.mesh import build_mesh
-from spadwarp.result import COMPONENTS, Reconstruction, Result
+from spadwarp.result import Reconstruction, Result
 from spadwarp.scene import Scene
 from spadwarp.scene.camera import image_tangents
 from spadwarp.scene.sight import lines_of_sight
 from spadwarp.transport.model import build_model, trace_rays
-from spadwarp.values import ConfigError
+from spadwarp.transport.simulation import DEFAULT_TIME
+from spadwarp.values import ConfigError, check_real
 
-__all__ = ["known_light", "reconstruct"]
+__all__ = ["known_light", "reconstruct", "tracing_time"]
 
 Cube = NDArray[np.float32]
 
@@ -41,23 +42,43 @@ Cube = NDArray[np.float32]
 _ORDER = np.array([4, 2, 6, 0, 7, 1, 5, 3])
 _LENS = 4  # times as many rays where they meet the lens at different points
 _STEPS = np.array([0.7548776662, 0.5698402910])  # additive sequence in two dimensions (Roberts 2018)
+_RAYS = 1 << 16  # at a time
 _FINE = 4  # parts of a bin: light that is less than a bin late moves to the next
 # Delays [fine bins] of direct light and of surfaces in even light; of blurred light [bins], by the blur's radius.
 _DELAYS = ((0, 1), (1, 2), (2, 4), (4, 8), (8, 16), (16, 32), (32, 64), (64, 192))
 _EVEN_DELAYS = ((0, 4), (4, 16), (16, 64), (64, 256))
 _BLURRED_DELAYS = ((0, 1), (1, 3), (3, 8), (8, 20), (20, 50))
 _BLURS = (1, 3, 8, 20)  # of two boxes [pixels]
-# Radii of the windows, in pixels and bins, and of the one over which their errors are averaged.
+_ROW = 8  # a row of bins is as wide as this part of its distance from the true path
+# Radii of the windows, in pixels and rows, and of the one over which their errors are averaged.
 _WINDOWS = ((0, 0), (1, 0), (2, 0), (4, 0), (8, 0), (16, 0), (32, 0), (4, 1), (8, 2), (32, 4))
-_AROUND = (16, 1)
+_AROUND = ((3, 1), (16, 1))
+_ROW_WINDOWS, _ROW_AROUND = tuple((0, reach) for reach in (0, 1, 2, 4, 8, 16)), ((0, 8),)  # of sums over all pixels
+_COST = 1e-6, 5e-8  # seconds that a bin takes on two cores, on a GPU
 _FLOOR = 1e-3  # of the mean: forward-scattered light where none is predicted
-_ROUNDING = 1e-9  # of the most: what sums of rises and falls leave where no ray sees light
+
+
+def tracing_time(scene: Scene, time: float | None, device: str | None = None) -> float:
+    """Seconds for the photons of a run of so many [s], by default 60, that `reconstruct` ends; at least half."""
+    seconds = DEFAULT_TIME if time is None else check_real("time", time, "(0, 1e9] s")
+    bins = scene.camera.height * scene.camera.width * scene.gate.bins
+    return max(seconds - bins * _COST[pick_device(device).is_cuda], 0.5 * seconds)
+
+
+class KnownLight(NamedTuple):
+    """What truth rays know, arrays of the device by pixel: light up to a factor, in fine bins."""
+
+    direct: Any  # ballistic light
+    scattered: Any  # the same times the scattering on its way, as light that scattered forward has
+    even: Any  # surfaces in even light
+    span: Any  # first and last fine bin with light
+    covered: Any  # the part of a pixel whose surface has light of a bin or of an earlier one, by bin
 
 
 def reconstruct(result: Result, *, device: str | None = None) -> Result:
-    """The result with `Result.reconstruction`: its light without most of the noise; tallies stay as they are.
+    """The result with `Result.reconstruction`: its light without most of its noise; tallies stay as they are.
 
-    Of the histogram by component; derivatives and polarised channels are left as they are. Takes about 100 bytes a bin.
+    Of the histogram by component; derivatives and polarised channels are left as they are. Takes about 300 bytes a bin.
 
     Args:
         result: With two halves, `Result.halves`, and a scene whose files are still there.
@@ -68,37 +89,37 @@ def reconstruct(result: Result, *, device: str | None = None) -> Result:
     """
     from scipy.ndimage import distance_transform_edt
 
-    halves = np.stack([half.tallies * half.tally_value[..., None] for half in result.halves], dtype=np.float32)
-    scene, gate, pixels = result.scene, result.scene.gate, result.truth.depth.size
+    halves, scene, gate = result.halves, result.scene, result.scene.gate
     if not scene.has_straight_sight:
         raise ConfigError("reconstruct knows neither [surface] nor scan.mode = 'trajectory'", source=scene.source)
     if (focus := result.focus_distance) is not None:  # lens points matter where a point's image is half a pixel wide
         blur = scene.camera.aperture_radius * np.abs(1.0 / focus - 1.0 / result.truth.depth)
         focus = focus if np.nanmax(blur, initial=0.0) > 0.25 * scene.camera.pixel_tangent else None
     chosen = pick_device(device)
-    direct, even, covered = known_light(scene, focus, chosen)
-    fine: list[Any] = [wp.array(part.reshape(pixels, -1), dtype=float, device=chosen) for part in (direct, even)]
-    ballistic = _delayed(fine[0], (0, 1), _FINE).numpy().reshape(covered.shape)
+    known = known_light(scene, focus, chosen)
     # Scattered light of a pixel without a target is that of the nearest target.
     start = (result.true_path() / scene.medium.pulse_speed - gate.start) / gate.bin_width
     nearest = distance_transform_edt(np.isnan(start), return_distances=False, return_indices=True)
     aligned = np.clip(np.nan_to_num(np.rint(start[tuple(nearest)])), 0, gate.bins).astype(np.int64)
-    mean = halves.mean(axis=0)
-    predictions = ballistic, _forward(fine[0], fine[1], ballistic, mean[1]), _backscatter(covered, mean[2])
-    found = np.zeros_like(mean)
+    bins = _Rows(np.zeros_like(aligned), np.arange(gate.bins + 1), gate.bins, chosen)
+    rows = _Rows(aligned, _edges(-int(aligned.max()), gate.bins - int(aligned.min())), gate.bins, chosen)
+    plain = _Rows(np.zeros_like(aligned), _edges(0, gate.bins), gate.bins, chosen)
+    ballistic = bins.delayed(known.direct, known.span, (0, 1), _FINE).numpy().reshape(bins.shape)
+    share = halves[0].photons / result.photons
+    found = np.zeros((3, *bins.shape), np.float32)
 
     def smooth(k: int) -> Cube:
-        if not (result.tallies[k].any() and predictions[k].any()):
-            found[k] = mean[k]
-            return np.zeros_like(mean[k])
-        predicted = predictions[k] * np.float32(mean[k].sum(dtype=np.float64) / predictions[k].sum(dtype=np.float64))
-        predicted += np.float32(k == 1) * _FLOOR * predicted.mean()
-        start = aligned * (k < 2)
-        light, square = _smoothed(halves[0, k], halves[1, k], predicted, start, chosen)
-        # Windows are chosen by the same noise, which loses rare light: each aligned bin gets its own light back.
-        rows = np.arange(gate.bins) + (start.max() - start)[..., None]
-        traced, kept = (np.bincount(rows.ravel(), cube.ravel()) for cube in (result.component(COMPONENTS[k]), light))
-        found[k] = light * np.divide(traced, kept, out=np.zeros_like(kept), where=kept > 0.0)[rows]
+        parts = [(half.tallies[k] * half.tally_value[..., None]).astype(np.float32) for half in halves]
+        mean = np.float32(share) * parts[0] + np.float32(1.0 - share) * parts[1]
+        if not mean.any():
+            return mean
+        if k == 1:
+            predicted = _forward(known, ballistic, rows, bins, mean)
+        else:
+            predicted = _backscatter(known.covered.numpy().reshape(mean.shape), mean) if k else ballistic
+        predicted = predicted * np.float32(mean.sum(dtype=np.float64) / max(predicted.sum(dtype=np.float64), 1e-300))
+        predicted += np.float32(k == 1) * _FLOOR * mean.mean()
+        found[k], square = _smoothed(parts, mean, predicted, rows if k < 2 else plain, scattered=k > 0)
         return square
 
     with ThreadPoolExecutor(1 if chosen.is_cuda else 2) as threads:
@@ -106,67 +127,86 @@ def reconstruct(result: Result, *, device: str | None = None) -> Result:
     return replace(result, reconstruction=Reconstruction(histogram=found, error=np.sqrt(squares)))
 
 
-def known_light(scene: Scene, focus: float | None, device: wp.Device) -> tuple[Cube, Cube, Cube]:
-    """From truth rays: ballistic light and surfaces in even light, `[H, W, fine bin]`; the part of each pixel whose
-    surface has light of a bin or of an earlier one, `[H, W, T]`."""
-    camera, gate, count = scene.camera, scene.gate, scene.gate.bins * _FINE
-    model, shape = build_model(scene, device, build_mesh(scene), camera=False), (camera.height, camera.width)
-    row = count + 2  # what comes after the gate
-    first = np.arange(shape[0] * shape[1]).reshape(shape) * row
-    hits, rises = np.zeros(first.size * row), np.zeros((2, first.size * row))
+def known_light(scene: Scene, focus: float | None, device: wp.Device) -> KnownLight:
+    """From truth rays, also of a lens with this focus [m]."""
+    camera, gate = scene.camera, scene.gate
+    model, pixels = build_model(scene, device, build_mesh(scene), camera=False), camera.height * camera.width
+    light = wp.zeros((3, pixels, gate.bins * _FINE), dtype=float, device=device)
+    covered = wp.zeros((pixels, gate.bins), dtype=float, device=device)
+    known = KnownLight(light[0], light[1], light[2], wp.zeros(pixels, dtype=wp.vec2i, device=device), covered)
     radius = 0.0 if camera.pinhole or camera.port is not None or focus is None else camera.aperture_radius
-    places = list(_places(radius))
-    for place, lens in places if model.mesh is not None else ():
-        corners = np.stack(np.meshgrid(np.arange(shape[1]), np.arange(shape[0])), axis=-1)
-        view = np.concatenate([image_tangents(camera, corners + place), np.ones((*shape, 1))], axis=-1)
-        view = view - lens / (focus or math.inf)
-        slant = np.linalg.norm(view, axis=-1, keepdims=True)
-        lines = lines_of_sight(scene, view / slant)
-        _, along, normal, reflectance = trace_rays(model, lines.start + lens, lines.direction, shape)
-        point = lines.start + lens + along[..., None] * lines.direction
-        direction, way, path = lines.light_at(point)
-        path = path + along + lines.delay
-        _, free, _, _ = trace_rays(model, point - direction * way[..., None], direction, shape)
-        lit = ~(free < way * (1.0 - 1e-4) - 1e-3) * _footprint(scene, direction)
-        lit *= np.maximum(-(direction * normal).sum(axis=-1), 0.0) / way**2
-        even = reflectance * np.exp(-scene.medium.extinction * path) / slant[..., 0] ** 4
-        at = (path / scene.medium.pulse_speed - gate.start) / scene.gate.bin_width * _FINE
-        # Each ray stands for the part of the surface around it, whose times differ along both axes of the image.
-        towards = (normal * lines.direction).sum(axis=-1)[..., None]
-        slopes = []
-        for unit in np.eye(3)[:2]:
-            axis = unit * camera.pixel_tangent / (slant * len(_ORDER))
-            moved = axis - lines.direction * (normal * axis).sum(axis=-1, keepdims=True) / np.minimum(towards, -1e-3)
-            along_sight, along_light = (moved * lines.direction).sum(axis=-1), (moved * direction).sum(axis=-1)
-            slopes.append(along * (along_sight + along_light) * _FINE / (scene.medium.pulse_speed * gate.bin_width))
-        wide, narrow = np.maximum(*np.abs(slopes)), np.minimum(*np.abs(slopes))
-        inside = np.isfinite(even + lit + wide)
-        hits += np.bincount(first[inside] + np.clip(at[inside], 0, row - 1).astype(np.int64), minlength=hits.size)
-        start, width = at[inside], np.maximum(wide[inside], 1e-3)
-        for sign, moved in ((1.0, -0.5), (-1.0, 0.5)):  # evenly over the width: rises at its start, ends at its stop
-            for part in (-0.25, 0.25):
-                edge = np.clip(start + moved * width + part * narrow[inside], 0.0, count)
-                whole = edge.astype(np.int64)
-                for step, share in ((0, 1.0 - edge + whole), (1, edge - whole)):
-                    for rise, light in zip(rises, (even * lit, even), strict=True):
-                        np.add.at(rise, first[inside] + whole + step, (0.5 * sign / width) * share * light[inside])
-    covered = np.cumsum(hits.reshape(*shape, row), axis=-1)[..., _FINE - 1 : count : _FINE] / len(places)
-    sums = (np.cumsum(rise.reshape(*shape, row), axis=-1)[..., :count] for rise in rises)
-    cubes = *(np.where(part > _ROUNDING * part.max(), part, 0.0) for part in sums), covered
-    return tuple(cube.astype(np.float32) for cube in cubes)  # type: ignore[return-value]
+    places, lens = (part[:, None, None] for part in _places(radius))
+    height = max(1, _RAYS // (len(places) * camera.width))
 
-
-def _places(radius: float) -> Iterator[tuple[NDArray[Any], NDArray[Any]]]:
-    """Places within a pixel, and points of a lens of this radius [m] that is not behind a port [m]."""
-    side = len(_ORDER)
-    for k in range(side**2 * (_LENS if radius else 1)):
-        cell = np.array([k % side, k // side % side])
-        u, v = (k + 0.5) * _STEPS % 1.0
-        r, angle = radius * math.sqrt(u), 2.0 * math.pi * v
-        yield (
-            (cell + (_ORDER[cell[::-1]] + 0.5) / side) / side,
-            np.array([r * math.cos(angle), r * math.sin(angle), 0.0]),
+    def add(first: int) -> None:
+        """Rays of rows of the image from this one on."""
+        corners = np.stack(
+            np.meshgrid(np.arange(camera.width), np.arange(first, min(first + height, camera.height))), -1
         )
+        rays = _trace(scene, model, corners + places, lens, focus)
+        shape = (len(places), corners.shape[0] * camera.width)
+        inputs: list[Any] = [
+            wp.array(part.reshape(*shape, *part.shape[3:]), dtype=dtype, device=device)
+            for part, dtype in zip(rays, (wp.float64, wp.vec2d, wp.vec3), strict=True)
+        ]
+        outputs = [first * camera.width, light, known.span, known.covered]
+        wp.launch(sk.deposit_kernel, dim=shape[1], inputs=inputs, outputs=outputs, device=device)
+
+    starts = range(0, camera.height, height) if model.mesh is not None else ()
+    for start in starts[:1]:
+        add(start)  # which loads the kernels
+    with ThreadPoolExecutor(1 if device.is_cuda else 2) as threads:
+        list(threads.map(add, starts[1:]))
+    return known
+
+
+def _trace(scene: Scene, model: sk.Model, places: Any, lens: Any, focus: float | None) -> tuple[Any, Any, Any]:
+    """Of rays through places of the image and points of the lens `[ray, H, W]`: time [fine bin], NaN for none, its
+    widths along both axes of the image, ballistic light and that of a surface in even light."""
+    camera, gate, shape = scene.camera, scene.gate, places.shape[:-1]
+    view = np.concatenate([image_tangents(camera, places), np.ones((*shape, 1))], axis=-1)
+    view -= lens / (focus or math.inf)
+    slant = np.linalg.norm(view, axis=-1, keepdims=True)
+    lines, flat = lines_of_sight(scene, view / slant), (shape[0] * shape[1], shape[2])
+    start = lines.start + lens
+
+    def trace(origins: Any, directions: Any) -> list[Any]:
+        found = trace_rays(model, origins.reshape(*flat, 3), directions.reshape(*flat, 3), flat)[1:]
+        return [part.reshape(*shape, *part.shape[2:]) for part in found]
+
+    along, normal, reflectance = trace(start, lines.direction)
+    point = start + along[..., None] * lines.direction
+    direction, way, path = lines.light_at(point)
+    begin = point - direction * way[..., None]
+    free = trace(begin, direction)[0]
+    lit = ~(free < way * (1.0 - 1e-4) - 1e-3) * _footprint(scene, direction)
+    lit *= np.maximum(-(direction * normal).sum(axis=-1), 0.0) / way**2
+    depth = scene.optical_depth(start, point) + scene.optical_depth(begin, point)
+    even = reflectance * np.exp(-depth) / slant[..., 0] ** 4
+    scattered = even * lit * np.expm1(depth * scene.medium.range.albedo)
+    fine = _FINE / (scene.medium.pulse_speed * gate.bin_width)
+    time = (path + along + lines.delay) * fine - gate.start / gate.bin_width * _FINE
+    # Each ray stands for the part of the surface around it, whose times differ along both axes of the image.
+    towards = (normal * lines.direction).sum(axis=-1)[..., None]
+    slopes = []
+    for unit in np.eye(3)[:2]:
+        axis = unit * camera.pixel_tangent / (slant * len(_ORDER))
+        moved = axis - lines.direction * (normal * axis).sum(axis=-1, keepdims=True) / np.minimum(towards, -1e-3)
+        slopes.append(along * (moved * (lines.direction + direction)).sum(axis=-1) * fine)
+    wide, narrow = np.maximum(*np.abs(slopes)), np.minimum(*np.abs(slopes))
+    time[~np.isfinite(even + lit + wide)] = np.nan
+    return time, np.stack([np.maximum(wide, 1e-3), narrow], axis=-1), np.stack([even * lit, scattered, even], axis=-1)
+
+
+def _places(radius: float) -> tuple[NDArray[Any], NDArray[Any]]:
+    """Places within a pixel, and points of a lens of this radius [m] that is not behind a port [m]; `[ray, 2 or 3]`."""
+    side = len(_ORDER)
+    k = np.arange(side**2 * (_LENS if radius else 1))
+    cell = np.stack([k % side, k // side % side], axis=-1)
+    u, v = ((k[:, None] + 0.5) * _STEPS % 1.0).T
+    r, angle = radius * np.sqrt(u), 2.0 * math.pi * v
+    lens = np.stack([r * np.cos(angle), r * np.sin(angle), np.zeros_like(r)], axis=-1)
+    return (cell + (_ORDER[cell[:, ::-1]] + 0.5) / side) / side, lens
 
 
 def _footprint(scene: Scene, direction: NDArray[np.float64]) -> NDArray[np.float64]:
@@ -180,36 +220,77 @@ def _footprint(scene: Scene, direction: NDArray[np.float64]) -> NDArray[np.float
     return np.exp(-2.0 * (cosine**-2 - 1.0) / math.tan(beam.half_angle) ** 2) / cosine**3
 
 
-def _delayed(fine: wp.array, delay: tuple[int, int], per_bin: int) -> wp.array:
-    """Light `[pixel, fine bin]` by a delay of so many fine bins, in bins."""
-    late = wp.empty((fine.shape[0], fine.shape[1] // per_bin), dtype=float, device=fine.device)
-    wp.launch(sk.delay_kernel, dim=fine.shape[0], inputs=[fine, *delay, per_bin, late], device=fine.device)
-    return late
+def _edges(low: int, high: int) -> NDArray[np.int64]:
+    """Edges of rows of bins around 0, from at most `low` to at least `high`."""
+    ends = [0]
+    while ends[-1] < max(-low, high):
+        ends.append(ends[-1] + max(1, ends[-1] // _ROW))
+    before, after = (ends[: bisect.bisect_left(ends, limit) + 1] for limit in (-low, high))
+    return np.array([*(-end for end in before[:0:-1]), *after])
 
 
-def _forward(direct: Any, even: Any, ballistic: Cube, light: Cube) -> Cube:
+class _Rows:
+    """Rows of bins, which count from a bin of each pixel."""
+
+    def __init__(self, start: NDArray[np.int64], edges: NDArray[np.int64], bins: int, device: wp.Device) -> None:
+        self.shape, self.device, self.count = (*start.shape, bins), device, len(edges) - 1
+        self._start, self._edges = start, edges
+        self._on_device: list[Any] = [wp.array(part.ravel(), dtype=int, device=device) for part in (start, edges)]
+        self.every: Any = wp.full(start.size, wp.vec2i(0, bins), dtype=wp.vec2i, device=device)
+
+    def delayed(self, light: Any, span: Any, delay: tuple[int, int], per_bin: int, factor: float = 1.0, to: Any = None):
+        """Light `[pixel, fine bin]` by a delay of so many fine bins, times a factor, `[pixel, row]`; added to `to`."""
+        to = wp.zeros((light.shape[0], self.count), dtype=float, device=self.device) if to is None else to
+        inputs = [light, span, wp.vec2i(*delay), per_bin, *self._on_device, factor, to]
+        wp.launch(sk.delay_kernel, dim=light.shape[0], inputs=inputs, device=self.device)
+        return to
+
+    def summed(self, cube: NDArray[Any]) -> Cube:
+        """Of bins `[H, W, T]` the sums in rows `[H, W, R]`."""
+        light: Any = wp.array(cube.reshape(-1, cube.shape[-1]), dtype=float, device=self.device)
+        return self.delayed(light, self.every, (0, 1), 1).numpy().reshape(*cube.shape[:2], -1)
+
+    def spread(self, values: NDArray[Any]) -> NDArray[Any]:
+        """Of rows `[H, W, R]` the value of each bin `[H, W, T]`."""
+        row_of = np.repeat(np.arange(self.count), np.diff(self._edges))
+        index = row_of[np.arange(self.shape[-1]) - self._start[..., None] - self._edges[0]]
+        return np.take_along_axis(values, index, axis=-1)
+
+
+def _forward(known: KnownLight, ballistic: Cube, rows: _Rows, bins: _Rows, light: Cube) -> Cube:
     """Prediction of forward-scattered light from its tallies."""
     from scipy.ndimage import uniform_filter
     from scipy.optimize import nnls
 
-    terms = [_delayed(direct, delay, _FINE).numpy() for delay in _DELAYS]
-    terms += [_delayed(even, delay, _FINE).numpy() for delay in _EVEN_DELAYS]
+    device, flat = rows.device, (known.direct.shape[0], ballistic.shape[-1])
+    terms: list[Any] = [(known.direct, known.span, delay, _FINE) for delay in _DELAYS]
+    terms += [(known.scattered, known.span, delay, _FINE) for delay in _DELAYS]
+    terms += [(known.even, known.span, delay, _FINE) for delay in _EVEN_DELAYS]
+    lit = np.flatnonzero(ballistic.any(axis=(0, 1)))
+    first, last = (lit[0], lit[-1] + 1) if len(lit) else (0, 0)
+    span = wp.full(len(known.span), wp.vec2i(int(first), int(last)), dtype=wp.vec2i, device=device)
     for radius in _BLURS:
         box = {"size": (2 * radius + 1, 2 * radius + 1, 1), "mode": "constant"}
-        blurred = uniform_filter(uniform_filter(ballistic, **box), **box)
-        pixels: Any = wp.array(blurred.reshape(direct.shape[0], -1), dtype=float, device=direct.device)
-        terms += [_delayed(pixels, delay, 1).numpy() for delay in _BLURRED_DELAYS]
-    sums = [float(term.sum(dtype=np.float64)) for term in terms]
-    rows = np.stack([term.ravel() / total for term, total in zip(terms, sums, strict=True) if total > 0.0])
+        blurred = np.zeros_like(ballistic)
+        blurred[..., first:last] = uniform_filter(uniform_filter(ballistic[..., first:last], **box), **box)
+        pixels: Any = wp.array(blurred.reshape(flat), dtype=float, device=device)
+        terms += [(pixels, span, delay, 1) for delay in _BLURRED_DELAYS]
+    columns = np.stack([rows.delayed(*term).numpy().ravel() for term in terms])
+    columns /= (sums := np.maximum(columns.sum(axis=1), 1e-30))[:, None]
+    light = rows.summed(light)
     # Weights: the variance of light is about proportional to it.
     level = uniform_filter(light, (7, 7, 5), mode="constant").ravel()
     root = 1.0 / np.sqrt(level + 0.02 * level.max() + 1e-300)
-    rows *= root
+    columns *= root
     # Least squares by the products of the terms, of which float32 leaves no more than its rounding.
-    values, vectors = np.linalg.eigh((rows @ rows.T).astype(np.float64))
+    values, vectors = np.linalg.eigh((columns @ columns.T).astype(np.float64))
     scale = np.sqrt(np.maximum(values, np.finfo(np.float32).eps * values[-1]))[:, None]
-    factors, _ = nnls(scale * vectors.T, (vectors.T / scale) @ (rows @ (light.ravel() * root)))
-    return ((factors.astype(np.float32) @ rows) / root).reshape(light.shape)
+    factors, _ = nnls(scale * vectors.T, (vectors.T / scale) @ (columns @ (light.ravel() * root)))
+    total = wp.zeros(flat, dtype=float, device=device)
+    for (pixels, span, delay, per_bin), factor in zip(terms, factors / sums, strict=True):
+        if factor > 0.0:
+            bins.delayed(pixels, span, delay, per_bin, factor, total)
+    return total.numpy().reshape(ballistic.shape)
 
 
 def _backscatter(covered: Cube, light: Cube) -> Cube:
@@ -219,30 +300,42 @@ def _backscatter(covered: Cube, light: Cube) -> Cube:
     return sum(part * (total / np.maximum(pixels, 1e-6)) for part, total, pixels in parts)  # type: ignore[return-value]
 
 
-def _smoothed(first: Cube, second: Cube, predicted: Cube, start: Any, device: wp.Device) -> tuple[Cube, Cube]:
-    """Light of a component and its squared error `[H, W, T]`. `start`: bin from which those of a pixel are counted."""
-    bins, shift = first.shape[-1], int(start.max()) - start
-    rows = np.arange(bins) + shift[..., None]
-    cubes = [first, second, 0.25 * (first - second) ** 2, predicted]
-    shape = (*first.shape[:2], bins + int(shift.max()))
-    aligned = np.zeros((*shape, 4), np.float32)
-    for k, cube in enumerate(cubes):
-        np.put_along_axis(aligned[..., k], rows, cube, axis=-1)
-    scale = float(predicted.max())  # float32 holds the squares of what is near 1
-    aligned *= np.array([1.0, 1.0, 1.0 / scale, 1.0], np.float32) / scale
-    values: Any = wp.array(aligned, dtype=wp.vec4, device=device)
-    sums, work, risk, around, blended = (wp.zeros(shape, dtype=wp.vec4, device=device) for _ in range(5))
-    for window in _WINDOWS:
+def _smoothed(halves: list[Cube], mean: Cube, predicted: Cube, rows: _Rows, *, scattered: bool) -> tuple[Cube, Cube]:
+    """Light of a component and its squared error `[H, W, T]`."""
+    scale, known = predicted.max() or np.float32(1.0), predicted > 0.0  # float32 holds the squares of what is near 1
+    first, second = (half / scale for half in halves)
+    noise = 0.25 * (first - second) ** 2
+    values = np.stack([rows.summed(cube * known) for cube in (first, second, noise, predicted / scale)], axis=-1)
+    light, square = _blended(values, _WINDOWS, _AROUND, rows.device)
+    # Windows are chosen by the same noise, which loses rare light: rows get their own light back, with its noise.
+    total = values.sum(axis=(0, 1), dtype=np.float64, keepdims=True)
+    total /= max(float(total[..., 3].max()), 1e-30)
+    total[..., 2] = 0.25 * (total[..., 0] - total[..., 1]) ** 2
+    whole, its = _blended(total.astype(np.float32), _ROW_WINDOWS[: None if scattered else 1], _ROW_AROUND, rows.device)
+    kept = light.sum(axis=(0, 1), dtype=np.float64, keepdims=True)
+    kept *= scale * max(float(whole.sum()), 1e-30) / max((mean * known).sum(dtype=np.float64), 1e-300)
+    light *= np.divide(whole, kept, out=np.zeros_like(kept), where=kept > 0.0)
+    square += light**2 * np.divide(its, whole**2, out=np.zeros_like(kept), where=whole > 0.0)
+    ratio, its = (rows.spread(part / np.maximum(values[..., 3], 1e-30)) for part in (light, np.sqrt(square)))
+    return np.where(known, predicted * ratio, mean), np.where(known, (predicted * its) ** 2, noise * scale**2)
+
+
+def _blended(cube: Cube, windows: Any, arounds: Any, device: wp.Device) -> tuple[Cube, Cube]:
+    """Estimates from windows and their squared errors `[H, W, R]`, of what `_Rows.gathered` has `[H, W, R, 4]`."""
+    values: Any = wp.array(cube, dtype=wp.vec4, device=device)
+    sums, work, risk, near, blended = (wp.zeros(values.shape, dtype=wp.vec4, device=device) for _ in range(5))
+    for window in windows:
         sk.window_sums(values, window, work, sums)
-        wp.launch(sk.estimate_kernel, dim=shape, inputs=[values, sums, risk], device=device)
-        sk.window_sums(risk, _AROUND, work, around)
-        wp.launch(sk.blend_kernel, dim=shape, inputs=[values, sums, around, blended], device=device)
-    wp.launch(sk.combine_kernel, dim=shape, inputs=[values, blended, sums], device=device)
-    sk.window_sums(sums, _AROUND, work, around)
-    found, own, near = blended.numpy(), sums.numpy()[..., 1:3], around.numpy()
-    # One standard error more than the halves show. A window holds its own voxel: differences of float32 leave less.
-    bias = np.maximum(near[..., 0] + np.sqrt(np.maximum(near[..., 3], 0.0) * own[..., 1]), 0.0)
-    bias *= own[..., 1] / np.maximum(np.maximum(near[..., 2], own[..., 1]), 1e-30)
-    light = 0.5 * scale * np.maximum(found[..., 0] + found[..., 1], 0.0)  # differences of float32 end below 0
-    square = scale**2 * (own[..., 0] + bias)
-    return tuple(np.take_along_axis(cube, rows, axis=-1) for cube in (light, square))  # type: ignore[return-value]
+        wp.launch(sk.estimate_kernel, dim=values.shape, inputs=[values, sums, risk], device=device)
+        sk.window_sums(risk, arounds[0], work, near)
+        wp.launch(sk.blend_kernel, dim=values.shape, inputs=[values, sums, near, blended], device=device)
+    wp.launch(sk.combine_kernel, dim=values.shape, inputs=[values, blended, risk], device=device)
+    found, own = blended.numpy(), risk.numpy()
+    bias = np.zeros_like(own[..., 0])
+    for reach in arounds:
+        sk.window_sums(risk, reach, work, near)
+        mean = near.numpy()
+        # One standard error more than the halves show. A window holds its own voxel: differences of float32 leave less.
+        more = np.maximum(mean[..., 0] + np.sqrt(np.maximum(mean[..., 3], 0.0) * own[..., 2]), 0.0)
+        bias = np.maximum(bias, more * own[..., 2] / np.maximum(np.maximum(mean[..., 2], own[..., 2]), 1e-30))
+    return 0.5 * np.maximum(found[..., 0] + found[..., 1], 0.0), own[..., 1] + bias  # float32 may end below 0

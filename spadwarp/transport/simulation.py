@@ -53,8 +53,9 @@ _BLOCK_SECONDS = 5.0
 # Checkpoints take at most this share of the time.
 _LARGEST_SHARE = 0.02
 
-# Seconds of a run whose error decides its photons, and the least part of these for which it goes on.
-_SECONDS, _LEAST_PART = 60.0, 0.05
+DEFAULT_TIME = 60.0
+"""Seconds of a run whose error decides its photons."""
+_LEAST_PART = 0.05  # of the photons, for which such a run goes on
 
 FIRST_LOOK = 32
 """Batches after which a run whose goal is a relative error first looks at it."""
@@ -151,7 +152,7 @@ def simulate(
     )
     if time is not None and not plan.is_auto:
         raise ConfigError(f"time = {shown(time)} goes with photons = 'auto'")
-    seconds = _SECONDS if time is None else check_real("time", time, "(0, 1e9] s")
+    seconds = DEFAULT_TIME if time is None else check_real("time", time, "(0, 1e9] s")
     with ExitStack() as stack:
         stopped = stack.enter_context(interruptible())
         if progress is not None:

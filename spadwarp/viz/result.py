@@ -223,7 +223,7 @@ def _result_figure(
     if kind == "intensity":
         panels.unclear = unclear
         per_pulse = result.scene.laser.photons_per_pulse * result.scene.detections_per_photon
-        ballistic = result.tallies[result.scene.components.index("ballistic")].sum(axis=-1) * result.tally_value
+        ballistic = result.expected("ballistic").sum(axis=-1)
         panels.show_intensity(result.intensity * per_pulse, "All light in the gate", "expected detections per pulse")
         panels.unclear = None
         panels.show_intensity(ballistic * per_pulse, "Ballistic light alone", "expected detections per pulse")
@@ -258,7 +258,7 @@ def _result_figure(
 
 def _histogram_figure(result: Result, width: float, pixel: tuple[int, int] | None) -> Figure:
     # By ballistic light on the target: in a short run a rare photon of large weight can make any pixel bright.
-    ballistic = result.tallies[0].sum(axis=2)
+    ballistic = result.expected("ballistic").sum(axis=2)
     on_target = np.isfinite(result.truth.depth) & bool(ballistic.any())
     pixels = _typical_pixels(np.where(on_target, ballistic, result.intensity), result.truth.depth, pixel)
     unclear = unclear_pixels(result)
@@ -357,7 +357,8 @@ def _caption(result: Result) -> str:
     photons = style.power_text(result.photons) if result.photons >= 1e6 else count(result.photons)
     partial = ", interrupted" if result.partial else ""
     light = channel_text(result.provenance.get("channel"))
-    return f"{photons} photons{partial}{light}; {_water_text(result.scene.medium)}; seed {result.seed}"
+    better = "" if result.reconstruction is None else ", reconstructed"
+    return f"{photons} photons{partial}{better}{light}; {_water_text(result.scene.medium)}; seed {result.seed}"
 
 
 def channel_text(channel: str | None) -> str:

@@ -4,7 +4,14 @@ from typing import Any
 
 import warp as wp
 
-__all__ = ["blend_kernel", "combine_kernel", "delay_kernel", "estimate_kernel", "window_sums"]
+__all__ = [
+    "blend_kernel",
+    "combine_kernel",
+    "delay_kernel",
+    "deposit_kernel",
+    "estimate_kernel",
+    "window_sums",
+]
 
 _Cube = wp.array3d[wp.vec4]
 _BLOCK = 64  # neighbours that a thread of a processor takes, so that it reads whole lines of its cache
@@ -68,20 +75,81 @@ def window_sums(values: wp.array, radius: tuple[int, int], work: wp.array, sums:
 
 
 @wp.kernel(enable_backward=False)
-def delay_kernel(fine: wp.array2d[float], first: int, last: int, per_bin: int, delayed: wp.array2d[float]):
-    """Light `[pixel, fine bin]` that comes later by first to last - 1 fine bins, evenly, in bins. Launch: (pixel)."""
+def deposit_kernel(
+    time: wp.array2d[wp.float64],
+    width: wp.array2d[wp.vec2d],
+    light: wp.array2d[wp.vec3],
+    first: int,
+    known: wp.array3d[float],
+    span: wp.array[wp.vec2i],
+    covered: wp.array2d[float],
+):
+    """Rays `[ray, pixel]` into fine bins of pixels from `first` on: three kinds of light, the part of rays that met a
+    surface before a bin ends. Launch: (pixel).
+
+    `time`: middle [fine bin], NaN for none; `width`: along both axes of a pixel, over which light spreads; `span`: fine
+    bins with light.
+    """
+    i = wp.tid()
+    pixel, rays, count = first + i, time.shape[0], known.shape[2]
+    per_bin, low, high = count // covered.shape[1], int(count), int(0)
+    for ray in range(rays):
+        middle, size = time[ray, i], width[ray, i]
+        if wp.isfinite(middle) and middle < wp.float64(count):
+            at = int(wp.max(middle, wp.float64(0.0))) // per_bin
+            covered[pixel, at] += 1.0 / float(rays)
+        if wp.isfinite(middle):
+            for side in range(2):  # of the narrow one: two points with its standard deviation, about
+                moved = middle + (wp.float64(side) - wp.float64(0.5)) * wp.float64(0.5) * size[1]
+                start, stop = moved - wp.float64(0.5) * size[0], moved + wp.float64(0.5) * size[0]
+                last = int(wp.ceil(wp.clamp(stop, wp.float64(0.0), wp.float64(count - 1)))) + 1
+                begin = int(wp.clamp(start, wp.float64(0.0), wp.float64(count)))
+                for k in range(begin, wp.min(last, count)):
+                    after = wp.float64(k + 1)
+                    risen = wp.clamp(after - start, wp.float64(0.0), wp.float64(1.0))
+                    part = risen - wp.clamp(after - stop, wp.float64(0.0), wp.float64(1.0))
+                    share = float(wp.float64(0.5) * part / size[0])
+                    for kind in range(known.shape[0]):
+                        known[kind, pixel, k] += share * light[ray, i][kind]
+                if begin < count and stop > wp.float64(0.0):
+                    low, high = wp.min(low, begin), wp.max(high, wp.min(last, count))
+    for k in range(1, covered.shape[1]):
+        covered[pixel, k] += covered[pixel, k - 1]
+    span[pixel] = wp.vec2i(low, high)
+
+
+@wp.kernel(enable_backward=False)
+def delay_kernel(
+    light: wp.array2d[float],
+    span: wp.array[wp.vec2i],
+    delay: wp.vec2i,
+    per_bin: int,
+    start: wp.array[int],
+    edges: wp.array[int],
+    factor: float,
+    rows: wp.array2d[float],
+):
+    """Adds light `[pixel, fine bin]` that comes later by delay[0] to delay[1] - 1 fine bins, evenly, to rows of bins.
+
+    `edges` of the rows count bins from the pixel's `start`; `span`: fine bins with light. Launch: (pixel).
+    """
     pixel = wp.tid()
-    late = wp.float64(0.0)
-    for k in range(delayed.shape[1]):
-        total = wp.float64(0.0)
-        for step in range(per_bin):
-            at = k * per_bin + step
-            if at >= first:
-                late += wp.float64(fine[pixel, at - first])
-            if at >= last:
-                late -= wp.float64(fine[pixel, at - last])
-            total += late
-        delayed[pixel, k] = float(total / wp.float64(last - first))
+    first, last, low, high = delay[0], delay[1], span[pixel][0], span[pixel][1]
+    scale, count = wp.float64(factor) / wp.float64(last - first), rows.shape[1]
+    late, total, row = wp.float64(0.0), wp.float64(0.0), int(0)
+    for k in range(low + first, wp.min(high + last, light.shape[1])):
+        if k - first < high:
+            late += wp.float64(light[pixel, k - first])
+        if k - last >= low:
+            late -= wp.float64(light[pixel, k - last])
+        at = k // per_bin - start[pixel]
+        if at >= edges[row + 1] and row < count - 1:
+            rows[pixel, row] += float(scale * total)
+            total = wp.float64(0.0)
+            while row < count - 1 and at >= edges[row + 1]:
+                row += 1
+        total += late
+    rows[pixel, row] += float(scale * total)
 
 
 @wp.func
