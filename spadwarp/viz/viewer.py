@@ -515,7 +515,7 @@ def _write_gif(pictures: Iterator[NDArray[np.uint8]], path: Path, fps: float) ->
     for picture in pictures:
         image = Image.fromarray(picture)
         # One palette for all pictures, from the colour bar in the first, so that colours do not flicker.
-        palette = image.quantize(255) if palette is None else palette
+        palette = image.quantize(255, Image.Quantize.MAXCOVERAGE) if palette is None else palette
         frames.append(image.quantize(palette=palette, dither=Image.Dither.NONE))
     frames[0].save(
         path, format="GIF", save_all=True, append_images=frames[1:], duration=round(1000 / fps), loop=0, optimize=False
