@@ -18,17 +18,8 @@ from spadwarp_kernels.base.check import ArgumentError
 from spadwarp_kernels.base.kernels import launch_pixels, memoised
 from spadwarp_kernels.base.native import expm1, log1p
 
-__all__ = [
-    "add_crosstalk",
-    "coates",
-    "dark_count_rates",
-    "event_counts",
-    "expected_detections",
-    "first_invalid_row",
-    "first_photon_counts",
-    "first_photon_probabilities",
-    "free_running_probabilities",
-]
+__all__ = ["add_crosstalk", "coates", "dark_count_rates", "event_counts", "expected_detections", "first_invalid_row"]
+__all__ += ["first_photon_counts", "first_photon_probabilities", "free_running_probabilities"]
 
 wp.set_module_options({"enable_backward": False})
 
