@@ -84,7 +84,15 @@ def without_defects(counts: ArrayLike, background: ArrayLike | BackgroundLaw, re
     return Usable(cubes, levels, taps, found, estimated)
 
 
-_FEWEST = 64
+_FEWEST, _MOST = 64, 512  # bins of the network
+_WIDEST = 5.0  # deviation of a response [bins]; few in the training are wider
+
+
+def merged_bins(bins: int, response: NDArray[Any]) -> int:
+    """How many of so many bins the network sees as one: where there are too many, or far more than the response has."""
+    place = np.arange(response.size) - response.size // 2
+    deviation = float(np.sqrt(np.maximum((response * place**2).sum() / response.sum(), 0.0)))
+    return max(-(-bins // _MOST), min(int(np.ceil(deviation / _WIDEST)), bins // _FEWEST), 1)
 
 
 def target_bins(
@@ -92,13 +100,14 @@ def target_bins(
 ) -> tuple[int, int, tuple[float, float]]:
     """First and last bin of the part of the gate that holds the target, and that part in depth [m].
 
-    Of at least `_FEWEST` bins, if the gate has so many: the network knows few histograms with less.
+    Of at least `_FEWEST` bins of the network, if the gate has so many: it knows no histograms with less.
     """
     cubes, levels, taps = checked_histograms(counts, background, response)
     first, stop = bins_of_target(cubes, levels, taps)
     bins = cubes.shape[-1]
-    first = max(0, min(first - max(0, _FEWEST - (stop - first)) // 2, bins - _FEWEST))
-    stop = min(bins, max(stop, first + _FEWEST))
+    fewest = _FEWEST * merged_bins(bins, taps)
+    first = max(0, min(first - max(0, fewest - (stop - first)) // 2, bins - fewest))
+    stop = min(bins, max(stop, first + fewest))
     width = (gate[1] - gate[0]) / bins
     return first, stop, (gate[0] + first * width, gate[0] + stop * width)
 

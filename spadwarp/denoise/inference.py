@@ -19,7 +19,7 @@ from spadwarp.denoise.frames import (
     depth_values,
     narrowed_input,
 )
-from spadwarp.denoise.histograms import histogram_tensors, target_bins, without_defects
+from spadwarp.denoise.histograms import histogram_tensors, merged_bins, target_bins, without_defects
 from spadwarp.denoise.network_files import MODELS, Precision, fast_precision, load_network, require_torch, torch_device
 from spadwarp.frames.backgrounds import BackgroundLaw, profile_of_depth
 from spadwarp.frames.depth import arrival_time
@@ -257,7 +257,6 @@ def estimate_histograms(
     return within_bins(Estimate(*(image.reshape(depth.shape) for image in found)))
 
 
-_MOST_BINS = 512  # finer histograms are rebinned
 _TILE, _MARGIN = 128, 32  # pixels of a large frame that are computed at once, and those around them that are seen
 
 
@@ -272,7 +271,7 @@ def _by_network(
     network = load_network("histograms", weights, str(torch_device(device)))
     with torch.inference_mode():
         for cube, level, taps in histogram_tensors(counts, background, response, device):
-            if (merged := -(-bins // _MOST_BINS)) > 1:
+            if (merged := merged_bins(bins, response)) > 1:
                 cube, level, taps = rebinned(cube, level, taps, merged)
             height, width = cube.shape[1:3]
             found = torch.empty(3, height, width)
@@ -285,6 +284,7 @@ def _by_network(
                 rows, columns = (slice(at - one, at - one + _TILE) for at, one in zip((top, left), first, strict=True))
                 found[:, top : top + _TILE, left : left + _TILE] = tile[:, rows, columns]
             found[0] *= merged * cube.shape[-1] / bins  # the last of merged bins may reach beyond the gate
+            found[0] += 0.5 * (merged % 2 == 0) / bins  # an even number has no middle: the response is that of the next
             answers.append(found)
     depth, confidence, target = torch.stack(answers, dim=1).numpy()
     return np.stack([depth, target, confidence])
