@@ -49,6 +49,7 @@ _DELAYS = ((0, 1), (1, 2), (2, 4), (4, 8), (8, 16), (16, 32), (32, 64), (64, 192
 _EVEN_DELAYS = ((0, 4), (4, 16), (16, 64), (64, 256))
 _BLURRED_DELAYS = ((0, 1), (1, 3), (3, 8), (8, 20), (20, 50))
 _BLURS = (1, 3, 8, 20)  # of two boxes [pixels]
+_DEEPEST = 80.0  # optical depth whose exponential float32 holds
 _ROW = 8  # a row of bins is as wide as this part of its distance from the true path
 # Radii of the windows, in pixels and rows, and of the one over which their errors are averaged.
 _WINDOWS = ((0, 0), (1, 0), (2, 0), (4, 0), (8, 0), (16, 0), (32, 0), (4, 1), (8, 2), (32, 4))
@@ -183,7 +184,7 @@ def _trace(scene: Scene, model: sk.Model, places: Any, lens: Any, focus: float |
     lit *= np.maximum(-(direction * normal).sum(axis=-1), 0.0) / way**2
     depth = scene.optical_depth(start, point) + scene.optical_depth(begin, point)
     even = reflectance * np.exp(-depth) / slant[..., 0] ** 4
-    scattered = even * lit * np.expm1(depth * scene.medium.range.albedo)
+    scattered = even * lit * np.expm1(np.minimum(depth * scene.medium.range.albedo, _DEEPEST))
     fine = _FINE / (scene.medium.pulse_speed * gate.bin_width)
     time = (path + along + lines.delay) * fine - gate.start / gate.bin_width * _FINE
     # Each ray stands for the part of the surface around it, whose times differ along both axes of the image.
@@ -336,6 +337,6 @@ def _blended(cube: Cube, windows: Any, arounds: Any, device: wp.Device) -> tuple
         sk.window_sums(risk, reach, work, near)
         mean = near.numpy()
         # One standard error more than the halves show. A window holds its own voxel: differences of float32 leave less.
-        more = np.maximum(mean[..., 0] + np.sqrt(np.maximum(mean[..., 3], 0.0) * own[..., 2]), 0.0)
+        more = np.maximum(mean[..., 0] + np.sqrt(np.maximum(mean[..., 3], 0.0)), 0.0)
         bias = np.maximum(bias, more * own[..., 2] / np.maximum(np.maximum(mean[..., 2], own[..., 2]), 1e-30))
     return 0.5 * np.maximum(found[..., 0] + found[..., 1], 0.0), own[..., 1] + bias  # float32 may end below 0

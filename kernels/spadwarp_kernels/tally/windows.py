@@ -195,9 +195,9 @@ def blend_kernel(values: _Cube, sums: _Cube, risk: _Cube, blended: _Cube):
 
 @wp.kernel(enable_backward=False)
 def combine_kernel(values: _Cube, blended: _Cube, risk: _Cube):
-    """Divides by the weights. Of the blend: bias², variance, prediction², bias⁴/prediction². Launch: as the cube."""
+    """Divides by the weights. Of the blend: bias², variance, prediction², bias⁴. Launch: as the cube."""
     i, j, k = wp.tid()
     own, found = values[i, j, k], blended[i, j, k] / wp.max(blended[i, j, k][3], 1.0e-30)
     blended[i, j, k] = found
     bias, expected = _product(own, found[0], found[1]), own[3] * own[3]
-    risk[i, j, k] = wp.vec4(bias, found[2] * found[2], expected, bias * bias / wp.max(expected, 1.0e-30))
+    risk[i, j, k] = wp.vec4(bias, found[2] * found[2], expected, bias * bias)
