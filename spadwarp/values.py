@@ -250,7 +250,7 @@ def _wrong_argument(
             except Exception:  # of a package that is not loaded
                 kind = Any
         single = parameter.kind not in (parameter.VAR_POSITIONAL, parameter.VAR_KEYWORD)
-        if name not in ("self", "cls") and single and not _fits(value, kind):
+        if name not in ("self", "cls") and single and "ArrayLike" not in text and not _fits(value, kind):
             return f"{name} = {shown(value)} is not of the type {text}"
         if "ArrayLike" in text and value is not None and not _holds_numbers(value):
             return f"{name} = {shown(value)} holds no numbers"

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator
-from typing import Any, NamedTuple
+from typing import Any, Literal, NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -141,7 +141,7 @@ def second_return(
     *,
     background: ArrayLike,
     response: ArrayLike,
-    side: int = 3,
+    side: Literal[1, 3, 5, 7, 9] = 3,
     device: str | None = None,
 ) -> NDArray[np.float32]:
     """Depth over the gate of a second return `[N, H, W]`; NaN where there is no significant one.

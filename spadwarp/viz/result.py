@@ -619,7 +619,7 @@ def draw_depth(
     intensity: NDArray[Any],
     path: str | Path,
     *,
-    quantity: str,
+    quantity: Literal["depth", "range"],
     title: str,
     width: float = PAGE,
 ) -> Path:
@@ -638,7 +638,7 @@ def draw_denoised(
     *,
     gate: tuple[float, float],
     title: str,
-    quantity: str = "depth",
+    quantity: Literal["depth", "range"] = "depth",
     truth: NDArray[np.float32] | None = None,
     width: float = PAGE,
 ) -> Path:

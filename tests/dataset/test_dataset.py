@@ -513,6 +513,7 @@ def test_commands(tmp_path):
         run(*make, *wrong, code=2)
 
 
+@pytest.mark.slow
 def test_hugging_face_reads_the_frames(folder, tmp_path):
     datasets = pytest.importorskip("datasets")
     files = {split: [str(folder / name) for name in (folder / f"{split}.txt").read_text().split()] for split in SPLITS}

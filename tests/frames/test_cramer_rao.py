@@ -123,6 +123,7 @@ def test_noise_of_the_simulation_does_not_count_as_information(law, shared):
         assert abs(by_variance.mean() - truth) > 2 * abs(by_halves.mean() - truth)
 
 
+@pytest.mark.slow
 @pytest.mark.filterwarnings("ignore:.*one of")
 def test_a_bound_that_is_noise_is_refused_with_the_photons_that_it_needs():
     """Against a run of many photons: what is given is near its bound, what would not be is refused."""

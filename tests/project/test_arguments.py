@@ -147,6 +147,7 @@ def test_a_device_that_does_not_exist_is_refused(name):
 # Types
 
 
+ONE = np.ones((4, 4))
 CALLS = {
     "path = 2147483648": lambda: spadwarp.load(2**31),
     "path =": lambda: spadwarp.load_scene(3),
@@ -155,6 +156,9 @@ CALLS = {
     "result": lambda: spadwarp.files.write_run(None, 3),
     "medium": lambda: Scene(medium=None),
     "extinction": lambda: Medium(extinction=-1.0),
+    "begin": lambda: Medium(extinction=1.0, albedo=0.5).optical_depth([1.0, 2.0], (0.0, 0.0, 1.0)),
+    "side = 0": lambda: spadwarp.denoise.second_return([[0.5]], [[[1]]], background=1.0, response=[1.0], side=0),
+    "quantity = 'peak'": lambda: spadwarp.viz.draw_depth(ONE, ONE, "a.png", quantity="peak", title=""),
 }
 
 

@@ -126,23 +126,6 @@ HALVES = [
 NAMES = (*ALL, "targets[1].reflectance")
 
 
-@pytest.mark.slow
-def test_light_by_way_of_mirrors(device):
-    """A closed box of mirrors: one scattering, any number of reflections, index 1."""
-    one = scene(
-        medium={"extinction": 0.3, "phase_index": 1.0},
-        laser={"position": [-0.1, 0.0, 1e-3]},
-        camera={"port": {"shape": "flat", "distance": 1e-5, "inside_index": 1.0}},
-        domain=MIRRORS,
-        targets=[{**half, "translation": [0.0, 0.0, 40.0]} for half in HALVES],
-        transport={"max_collisions": 6},
-    )
-    result = simulated(one, device, NAMES, 100_000)
-    assert within_path_limits(result)
-    h, by_a, by_b, *_ = sums(result)[:, 2]
-    assert 1.0 < 0.24 * (by_b - by_a) / h < 3.0  # mean number of scatterings
-
-
 @pytest.mark.filterwarnings("ignore:.*rounding to the histogram:RuntimeWarning")  # of what the water scatters
 @pytest.mark.slow
 def test_behind_a_port_the_path_is_that_in_water_and_lambertian_bounces_are_counted(device):

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 import spadwarp_kernels as sk
-from helpers.estimators import PHOTONS, SEEDS, agreeing_cells, cells
+from helpers.estimators import PHOTONS, SEEDS, agreeing_cells
 from helpers.runs import of_seeds
 from helpers.scenes import ELSEWHERE, LAYERS, PENCIL, PLATE, PLUME, scene
 from helpers.statistics_of_samples import equal_means_p
@@ -26,18 +26,6 @@ def test_estimators_agree_in_every_component(axis_threshold, photons, device):
     one = scene(transport={"axis_threshold": axis_threshold})
     cells = agreeing_cells(one, device, photons=photons, clear=photons is PHOTONS)
     assert (cells["guided"].reshape(SEEDS, 3, -1).sum(axis=(0, 2)) > 0).all()
-
-
-@pytest.mark.slow
-def test_a_table_of_henyey_greenstein_is_henyey_greenstein(device, tmp_path):
-    """Through the file, the table, and the directions and angles of its own that guided takes from it."""
-    angle = np.concatenate([[0.0], np.geomspace(0.01, 20.0, 400), np.linspace(20.0, 180.0, 641)[1:]])
-    value = sk.henyey_greenstein_density(2.0 * np.sin(np.radians(angle) / 2) ** 2, 0.8)
-    np.savetxt(tmp_path / "hg.csv", np.column_stack([angle, value]), delimiter=",", header="angle_deg,value")
-    table = {"phase_function": "tabulated", "phase_table": str(tmp_path / "hg.csv")}
-    one, other = (cells(scene(medium=water), device, 12_000) for water in ({}, table))
-    assert equal_means_p(one, other) > 1e-3
-    assert one.sum() == pytest.approx(other.sum(), rel=3e-3)
 
 
 WATERS = {

@@ -25,7 +25,9 @@ SAME = {"layers": [{"start": start, "extinction": 0.5, "albedo": 0.8} for start 
 DEPTH = 0.5 * 1.2 + 1.5 * 0.5 + 0.2 * 0.5
 
 
-@pytest.mark.parametrize("estimator", ["analog", pytest.param("next_event", marks=pytest.mark.slow), "guided"])
+@pytest.mark.parametrize(
+    "estimator", ["guided", *(pytest.param(one, marks=pytest.mark.slow) for one in ("analog", "next_event"))]
+)
 def test_layers_of_one_water_are_that_water(estimator, device):
     """Not a bit differs on the CPU; on CUDA the compiler may round differently."""
     transport = {"estimator": estimator}

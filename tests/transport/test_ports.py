@@ -196,7 +196,7 @@ def single_scatter_of(name):
 @pytest.mark.parametrize(
     ("name", "estimator"),
     [
-        ("flat", "next_event"),
+        pytest.param("flat", "next_event", marks=pytest.mark.slow),
         ("flat", "guided"),
         ("tilted", "guided"),
         pytest.param("dome", "guided", marks=pytest.mark.slow),

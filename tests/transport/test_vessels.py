@@ -8,16 +8,13 @@ import pytest
 
 import spadwarp_kernels as sk
 from helpers.estimators import cells
-from helpers.runs import of_seeds
 from helpers.scenes import scene
 from helpers.statistics_of_samples import equal_means_p
 from reference.aperture import Rig, count
 from reference.walk import Medium
 from spadwarp.device import pick_device
 from spadwarp.mesh import build_mesh
-from spadwarp.scene import Scene
 from spadwarp.transport.model import build_model, transport_spec
-from spadwarp.validate.cases import vessel_reading, vessel_scene
 from spadwarp_kernels.estimators.guided import LARGEST_WEIGHT_RATIO
 
 
@@ -78,18 +75,6 @@ def test_weights_of_guided_photons_are_bounded(extinction, reflectance, bound, d
     assert weight.max() <= bound * 1.0001
     # And the mean is that of the analog walk.
     assert weight.mean() == pytest.approx(1.0, abs=4 * weight.std() / np.sqrt(weight.size))
-
-
-@pytest.mark.slow
-@pytest.mark.physics
-@pytest.mark.parametrize(("estimator", "photons"), [("analog", 40_000), ("next_event", 50_000), ("guided", 60_000)])
-def test_a_closed_white_vessel_is_as_bright_as_its_volume_says(estimator, photons, device):
-    """Imaging through the lens centre, with the lens point on a disc, loses 29 % of this light."""
-    one = Scene.from_dict(vessel_scene(estimator))
-    read = [run.light.sum() for run in of_seeds(one, device, photons, range(16))]
-    error = np.std(read, ddof=1) / math.sqrt(16)
-    assert error < 0.02 * np.mean(read)
-    assert np.mean(read) == pytest.approx(vessel_reading(), abs=3 * error)
 
 
 @pytest.mark.slow

@@ -220,8 +220,8 @@ def draw_measured(path, width):
 
 
 # Of each module of pictures some; those of results, frames and scenes are drawn in notebooks and commands, too.
-QUICK = {"histogram", "frames", "denoised_alone", "sweep", "sweep_names", "budget", "targets", "scores", "reliability"}
-QUICK |= {"curves", "case", "narrow", "video"}
+QUICK = {"histogram", "frames", "denoised_alone", "sweep", "budget", "scores", "reliability"}
+QUICK |= {"curves", "case", "video"}
 
 PICTURES_OF_THE_DOCS = {
     "limits": draw_limits,

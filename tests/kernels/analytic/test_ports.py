@@ -49,7 +49,7 @@ def signal_map(name, half_angle, tangent, aim, device):
     return (out.numpy()[0] for out in analytic.signal_map(one, *inputs, optics=analytic.make_optics(kind, kind)))
 
 
-@pytest.mark.parametrize("name", PORTS)
+@pytest.mark.parametrize("name", ["dome", pytest.param("flat", marks=pytest.mark.slow)])
 def test_signal_of_a_pixel_is_that_of_its_rays(name, device):
     """E·(Γ/π)·T·(n_0/n_w)²·A·cosψ·dΩ_0 with E from the laser's intensity, by derivatives of rays; and of a spot that is
     smaller than the pixel, all of a pencil beam: (Γ/π)·cosθ_out·T·dΩ_w/dA·A·cosψ."""
