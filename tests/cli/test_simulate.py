@@ -81,6 +81,7 @@ def test_directory_in_use_is_refused_unless_overwritten(scene, tmp_path):
     assert {path.name for path in out.iterdir()} == FILES | {"mine.txt"}
 
 
+@pytest.mark.slow
 def test_lines_are_runs_of_their_own_beside_what_has_all_of_them(scene, tmp_path):
     out, changes = tmp_path / "out", ["--set=laser.wavelengths_nm=[650, 450]", "--set=medium.chlorophyll=0.5"]
     run("simulate", scene, "--out", out, *DEVICE, *changes, "--set=output.png=true")

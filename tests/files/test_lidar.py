@@ -108,6 +108,7 @@ def test_points_are_right_to_a_millimetre(result, cloud, tmp_path, ending):
         np.testing.assert_allclose(pipeline.arrays[0]["X"], cloud.position[:, 0], rtol=0.0, atol=1e-4)
 
 
+@pytest.mark.slow
 def test_waveforms_are_the_counts_of_each_shot(result, tmp_path):
     laspy = pytest.importorskip("laspy")
     paths = spadwarp.export(result, tmp_path / "shots.wdp", seed=3)

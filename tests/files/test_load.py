@@ -73,7 +73,7 @@ def test_view_depth_and_export_take_every_file_with_an_image(files, name, tmp_pa
     assert list((tmp_path / "exported").glob("*.npy")) and list((tmp_path / "exported").glob("*.exr"))
 
 
-@pytest.mark.parametrize("name", ["unfinished", "shard"])  # of counts, and of depths
+@pytest.mark.parametrize("name", ["unfinished", pytest.param("shard", marks=pytest.mark.slow)])  # counts, depths
 def test_denoise_takes_files_with_an_image(files, name, tmp_path):
     run("denoise", files[name], "--model", "median", "--out", tmp_path / "denoised", *DEVICE)
     written = list((tmp_path / "denoised").glob("*.npy"))

@@ -38,7 +38,7 @@ def first_photons(rng, pixels, background, pulses):
         (DECAY, {}),
         pytest.param(100.0 * DECAY, {"pulses": 20_000}, marks=pytest.mark.slow),  # which leaves 2 of 3 pulses
         (20.0 * DECAY, {"profile": 3.0 * DECAY}),
-        (np.full(BINS, 0.3 / BINS), {"profile": np.ones(BINS)}),
+        pytest.param(np.full(BINS, 0.3 / BINS), {"profile": np.ones(BINS)}, marks=pytest.mark.slow),
     ],
     ids=["few counts", "wide", "many counts", "backscatter", "pile-up", "level unknown", "few counts, level unknown"],
 )
