@@ -118,7 +118,7 @@ class Survey:
             nearest, begin = illuminated[ranges.argmin()], np.zeros(3)
             if scene.surface is not None and self.camera_port is not None:  # from the air: of the way in the water
                 begin = self.camera_port.enter(begin, self.camera_port.connect(nearest, begin)[0])[0]
-            self.optical_depth = scene.optical_depth(begin.tolist(), nearest.tolist())
+            self.optical_depth = float(scene.optical_depth(begin, nearest))
             if self.target_range[0] > 1e-5:
                 self.on_axis = self._on_axis(self.target_range[0], self.optical_depth)
 
@@ -243,8 +243,7 @@ def _check_lines(survey: Survey) -> None:
         first = next(iter(by_line.values()))
         survey.warn(field, f"at {', '.join(f'{one:g}' for one in by_line)} nm: {first.text}", **first.values)
     if len(lines) > 1 and len({line.medium.extinction for line in lines}) == 1 and survey.scene.medium.preset is None:
-        text = "all lines have the same water, by coefficients in numbers; medium.chlorophyll follows the wavelength"
-        survey.warn("laser.wavelengths_nm", text)
+        survey.warn("laser.wavelengths_nm", "all lines have the same water; that of medium.chlorophyll follows them")
 
 
 def summary(scene: SceneLike, mesh: TriangleMesh | None = None) -> dict[str, Any]:
@@ -527,7 +526,7 @@ def _check_ports(survey: Survey) -> None:
 
 
 def _check_scan(survey: Survey) -> None:
-    """Whether the beam of a confocal scan is where its pixel looks."""
+    """Whether the beam of a confocal scan is where its pixel looks, and what of the detector is then one pixel's."""
     scene, laser, axis = survey.scene, survey.scene.beam, survey.on_axis
     if scene.scan_positions == 1:
         return
@@ -541,16 +540,18 @@ def _check_scan(survey: Survey) -> None:
             f"axis as if it went along it, and a pixel sees {pixel_deg:.3g}°: 1 is exact"
         )
         survey.warn("transport.axis_threshold", text, degrees=snapped, pixel_deg=pixel_deg)
+    for name in ("crosstalk_probability", "dark_count_spread", "hot_pixel_fraction"):
+        if value := getattr(scene.detector, name):
+            text = f"{name} = {value:g} is drawn between positions of the scan, where one pixel looks at all of them"
+            survey.note(f"detector.{name}", text, **{name: value})
     if axis is None:
         return
     aside = math.hypot(*laser.position[:2]) * abs(1.0 - axis.distance / scene.scan.distance)
     spot = laser.beam_radius if laser.profile == "collimated" else math.tan(min(laser.half_angle, 1.5)) * axis.distance
     pixel = scene.camera.pixel_tangent * axis.distance
     if aside > spot + pixel:
-        text = (
-            f"at {axis.distance:.4g} m the beam is {aside:.3g} m beside what its pixel sees ({pixel:.3g} m wide, the "
-            f"spot's radius is {spot:.3g} m): scan.distance makes them cross"
-        )
+        text = f"at {axis.distance:.4g} m the beam is {aside:.3g} m beside what its pixel sees ({pixel:.3g} m wide, "
+        text += f"the spot's radius is {spot:.3g} m): scan.distance makes them cross"
         survey.warn("scan.distance", text, aside=aside, spot=spot, pixel=pixel)
 
 
@@ -884,7 +885,7 @@ def _grid_summary(scene: Scene) -> dict[str, Any] | None:
         "cells": list(cells.extinction.shape),
         "size": list(cells.size),
         "extinction": [float(cells.extinction.min()), float(cells.extinction.max())],
-        "optical_depth": scene.optical_depth((0.0, 0.0, 0.0), (0.0, 0.0, max(reach, 0.0))),
+        "optical_depth": float(scene.optical_depth((0.0, 0.0, 0.0), (0.0, 0.0, max(reach, 0.0)))),
         "bytes": cells.extinction.size * (8 if cells.anisotropy is None else 12),
     }
 

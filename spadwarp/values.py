@@ -250,9 +250,10 @@ def _wrong_argument(
             except Exception:  # of a package that is not loaded
                 kind = Any
         single = parameter.kind not in (parameter.VAR_POSITIONAL, parameter.VAR_KEYWORD)
-        if name not in ("self", "cls") and single and "ArrayLike" not in text and not _fits(value, kind):
+        of_numbers = "ArrayLike" in text.split(" | ")  # which are many types: what it holds says more
+        if name not in ("self", "cls") and single and not of_numbers and not _fits(value, kind):
             return f"{name} = {shown(value)} is not of the type {text}"
-        if "ArrayLike" in text and value is not None and not _holds_numbers(value):
+        if of_numbers and value is not None and not _holds_numbers(value):
             return f"{name} = {shown(value)} holds no numbers"
         if "Array" in text or hasattr(value, "shape"):
             arrays.append(f"{name} [{', '.join(map(str, getattr(value, 'shape', [])))}]")

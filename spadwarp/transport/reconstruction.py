@@ -322,7 +322,7 @@ def _smoothed(halves: list[Cube], mean: Cube, predicted: Cube, rows: _Rows, *, s
 
 
 def _blended(cube: Cube, windows: Any, arounds: Any, device: wp.Device) -> tuple[Cube, Cube]:
-    """Estimates from windows and their squared errors `[H, W, R]`, of what `_Rows.gathered` has `[H, W, R, 4]`."""
+    """Estimates from windows and their squared errors `[H, W, R]`; the cube: two halves, noise, prediction by row."""
     values: Any = wp.array(cube, dtype=wp.vec4, device=device)
     sums, work, risk, near, blended = (wp.zeros(values.shape, dtype=wp.vec4, device=device) for _ in range(5))
     for window in windows:
