@@ -118,7 +118,7 @@ class Survey:
             nearest, begin = illuminated[ranges.argmin()], np.zeros(3)
             if scene.surface is not None and self.camera_port is not None:  # from the air: of the way in the water
                 begin = self.camera_port.enter(begin, self.camera_port.connect(nearest, begin)[0])[0]
-            self.optical_depth = float(scene.optical_depth(begin, nearest))
+            self.optical_depth = scene.optical_depth(begin, nearest)
             if self.target_range[0] > 1e-5:
                 self.on_axis = self._on_axis(self.target_range[0], self.optical_depth)
 
@@ -885,7 +885,7 @@ def _grid_summary(scene: Scene) -> dict[str, Any] | None:
         "cells": list(cells.extinction.shape),
         "size": list(cells.size),
         "extinction": [float(cells.extinction.min()), float(cells.extinction.max())],
-        "optical_depth": float(scene.optical_depth((0.0, 0.0, 0.0), (0.0, 0.0, max(reach, 0.0)))),
+        "optical_depth": scene.optical_depth((0.0, 0.0, 0.0), (0.0, 0.0, max(reach, 0.0))),
         "bytes": cells.extinction.size * (8 if cells.anisotropy is None else 12),
     }
 

@@ -512,25 +512,25 @@ class Medium(PhaseLaw, Water):
         return WaterRange(max(extinction), max(scattering), max(0.0, min(absorption)), max(albedo), tuple(g))
 
     def optical_depth(self, begin: ArrayLike, end: ArrayLike) -> Any:
-        """∫c ds along straight lines between points of the world `[..., 3]` [m]."""
-        if self.grid is not None:
-            return grid_cells(self).optical_depths(begin, end, self.extinction)[()]
+        """∫c ds along straight lines between points of the world `[..., 3]` [m]; a float between two points."""
         first, last = np.asarray(begin, np.float64), np.asarray(end, np.float64)
         length = np.linalg.norm(last - first, axis=-1)
-        if not self.layers:
-            return self.extinction * length
-        axis = np.array(self.layer_axis) / math.hypot(*self.layer_axis)
-        heights = np.array(np.broadcast_arrays(first @ axis, last @ axis))
-        starts, extinction = (
-            [layer.start for layer in self.layers],
-            np.array([water.extinction for water in self.waters]),
-        )
-        here = extinction[np.searchsorted(starts, heights[0], side="right")]
-        across = extinction[0] * (heights[1] - heights[0])
-        for start, more in zip(starts, np.diff(extinction), strict=True):
-            across += more * np.diff(np.maximum(heights - start, 0.0), axis=0)[0]
-        way = heights[1] - heights[0]
-        return length * np.divide(across, way, out=np.broadcast_to(here, way.shape).copy(), where=way != 0.0)[()]
+        if self.grid is not None:
+            depth = grid_cells(self).optical_depths(begin, end, self.extinction)
+        elif not self.layers:
+            depth = self.extinction * length
+        else:
+            axis = np.array(self.layer_axis) / math.hypot(*self.layer_axis)
+            heights = np.array(np.broadcast_arrays(first @ axis, last @ axis))
+            starts = [layer.start for layer in self.layers]
+            extinction = np.array([water.extinction for water in self.waters])
+            here = extinction[np.searchsorted(starts, heights[0], side="right")]
+            across = extinction[0] * (heights[1] - heights[0])
+            for start, more in zip(starts, np.diff(extinction), strict=True):
+                across += more * np.diff(np.maximum(heights - start, 0.0), axis=0)[0]
+            way = heights[1] - heights[0]
+            depth = length * np.divide(across, way, out=np.broadcast_to(here, way.shape).copy(), where=way != 0.0)
+        return depth if np.ndim(depth) else float(depth)
 
     def to_dict(self) -> dict[str, Any]:
         """The fields that make an equal section again: of the coefficients the given ones, of the indices too."""
