@@ -314,6 +314,7 @@ def _smoothed(halves: list[Cube], mean: Cube, predicted: Cube, rows: _Rows, *, s
     total[..., 2] = 0.25 * (total[..., 0] - total[..., 1]) ** 2
     whole, its = _blended(total.astype(np.float32), _ROW_WINDOWS[: None if scattered else 1], _ROW_AROUND, rows.device)
     kept = light.sum(axis=(0, 1), dtype=np.float64, keepdims=True)
+    whole = np.where(kept > 0.0, whole, 0.0)  # what was smoothed into rows that hold no light would be lost
     kept *= scale * max(float(whole.sum()), 1e-30) / max((mean * known).sum(dtype=np.float64), 1e-300)
     light *= np.divide(whole, kept, out=np.zeros_like(kept), where=kept > 0.0)
     square += light**2 * np.divide(its, whole**2, out=np.zeros_like(kept), where=whole > 0.0)

@@ -126,7 +126,7 @@ LINES = {
     "parallel": (600, 566),
     "result": (1500, 2145),
     "scene": (3700, 5229),
-    "transport": (2300, 3428),
+    "transport": (2300, 3429),
     "validate": (750, 867),
     "viz": (2200, 2546),
     "water": (800, 848),
