@@ -14,7 +14,7 @@ import typer
 
 import spadwarp
 from spadwarp.cli import options as opt
-from spadwarp.cli.app import complain, note, say, wrong
+from spadwarp.cli.app import complain, note, running, say, wrong
 from spadwarp.cli.options import command
 from spadwarp.cli.outputs import answer, check_outputs, progress, readable, rows, short, show_table, write_json, written
 from spadwarp.values import count, with_prefix
@@ -252,13 +252,14 @@ def sweep(
           --vary laser.wavelength_nm=480,532 --vary camera.analyser=none,cross --out sweep/
     """
     read, texts = opt.read_scene(scene, overrides), vary or ["range="]
-    asked = no_range or photons or (depth_error, time, seed) != (0.01, 1.0, 0)  # what a budget does not take
+    of_plans = "--depth-error", "--time", "--photons", "--seed", "--no-range"
+    asked = any(option in running.given for option in of_plans)
     of = of or ("plan" if asked or len(texts) > 1 or texts[0].strip().startswith("camera.analyser") else "budget")
     of_range = of == "budget" and len(texts) == 1 and texts[0].partition("=")[0].strip() == "range"
     if not of_range:
         opt.refuse("is for a budget over range: --vary range=FROM:TO:N", "--medium", "--reflectance")
     if of == "budget":
-        opt.refuse("is for --of plan", "--depth-error", "--time", "--photons", "--seed", "--no-range")
+        opt.refuse("is for --of plan", *of_plans)
     stem = "budget" if of_range else "sweep"
     check_outputs(out, (f"{stem}.png", f"{stem}.csv"), inputs=(scene, *read.files))
     summary: dict[str, Any] = {}
