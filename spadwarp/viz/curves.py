@@ -96,6 +96,9 @@ def draw_sweep(curves: Sweep, path: str | Path | None = None, *, width: float = 
         _value_axis(axis, np.array([y, *ends]))
         if np.isnan(y).all():
             axis.text(0.5, 0.5, "not enough photons\nto judge", transform=axis.transAxes, ha="center", va="center")
+            axis.tick_params(axis="y", which="both", left=False, labelleft=False)
+            if numeric and np.ptp(x) > 0.0:
+                axis.set_xlim(x.min(), x.max())
         if not numeric:
             axis.set_xticks(range(len(ticks)), ticks, rotation=20, ha="right", rotation_mode="anchor")
             axis.set_xlim(-0.5, len(ticks) - 0.5)

@@ -128,7 +128,7 @@ LINES = {
     "scene": (3700, 5229),
     "transport": (2300, 3429),
     "validate": (750, 867),
-    "viz": (2200, 2546),
+    "viz": (2200, 2549),
     "water": (800, 848),
     "kernels/spadwarp_kernels": (50, 50),
     "kernels/analytic": (1650, 1676),
