@@ -278,8 +278,7 @@ def _frame_kernel(traced: bool) -> wp.Kernel:
         id = wp.uint64(sensor.step[0]) * wp.uint64(sensor.images.counts.shape[0]) + wp.uint64(row)
         draws = FirstPhotons()
         draws.left = pulses
-        search = begin_search(windows, row)
-        search.pulses = wp.float64(pulses)
+        search = begin_search(windows, row, wp.float64(pulses))
         for k in range(histogram.shape[1]):
             level = float(0.0)
             rate = float(0.0)
