@@ -100,7 +100,7 @@ class WindowSearch:
     """The best window of the bins of a pixel that have been offered so far, one after the other. In float32, whose
     rounding is far below the noise of counts: of two windows that it confuses, either will do."""
 
-    pulses: float  # of the histogram, see `DetectionTest`; 0: any number of counts
+    per_pulse: float  # 1 over the pulses of the histogram, see `DetectionTest`; 0: any number of counts
     left: wp.float64  # of the pulses, those without a count before the window
     total: float  # counts of the pixel, where the level is not known
     level: float  # of the background
@@ -119,7 +119,8 @@ class WindowSearch:
 def begin_search(search: Windows, pixel: int, pulses: wp.float64) -> WindowSearch:
     """The search in the bins from `search.first` on, with a known level."""
     s = WindowSearch()
-    s.pulses = float(pulses)
+    if pulses > ZERO:
+        s.per_pulse = float(ONE / pulses)
     s.left = pulses
     s.level = 1.0
     s.window = search.first
@@ -141,9 +142,9 @@ def offer_bin(search: Windows, s: WindowSearch, k: int, count: wp.int64, backgro
         if n > 0.0 and (s.begin > search.first or single):
             mean = wp.max((s.last_b + s.own_b) * s.level, _LEAST)
             trials = wp.where(search.level_known, _MANY * (n + mean), s.total)
-            if s.pulses > 0.0:
+            if s.per_pulse > 0.0:
                 trials = wp.max(float(s.left), n)
-                mean = wp.max(-trials * expm1(-mean / s.pulses), _LEAST)
+                mean = wp.max(-trials * expm1(-mean * s.per_pulse), _LEAST)
             excess = n - mean
             # The deviance is at most the square of the excess over the variance: most windows end here.
             if excess > 0.0 and excess * excess > s.deviance * mean * (1.0 - mean / trials):

@@ -236,7 +236,8 @@ def _expected(sensor: Sensor, light: PixelLight, k: int, water: float) -> float:
     if low > 9.0:
         return light.dark
     # From the side on which both are small, where a difference keeps its digits.
-    surface = wp.where(low > 0.0, _below(-low) - _below(-high), _below(high) - _below(low)) * light.signal
+    side = wp.where(low > 0.0, -1.0, 1.0)
+    surface = side * (_below(side * high) - _below(side * low)) * light.signal
     return light.dark + water * _below(-0.5 * (low + high)) + wp.max(surface, 0.0)
 
 
