@@ -119,8 +119,7 @@ class WindowSearch:
 def begin_search(search: Windows, pixel: int, pulses: wp.float64) -> WindowSearch:
     """The search in the bins from `search.first` on, with a known level."""
     s = WindowSearch()
-    if pulses > ZERO:
-        s.per_pulse = float(ONE / pulses)
+    s.per_pulse = wp.where(pulses > ZERO, float(ONE / pulses), 0.0)
     s.left = pulses
     s.level = 1.0
     s.window = search.first
@@ -138,8 +137,7 @@ def offer_bin(search: Windows, s: WindowSearch, k: int, count: wp.int64, backgro
     s.own_b += background
     if k + 1 == wp.min(s.begin + search.half_width, search.stop):
         n = s.last_n + s.own_n
-        single = search.stop - search.first <= search.half_width
-        if n > 0.0 and (s.begin > search.first or single):
+        if n > 0.0 and (s.begin > search.first or search.stop - search.first <= search.half_width):
             mean = wp.max((s.last_b + s.own_b) * s.level, _LEAST)
             trials = wp.where(search.level_known, _MANY * (n + mean), s.total)
             if s.per_pulse > 0.0:
@@ -167,8 +165,7 @@ def significance_of(search: Windows, s: WindowSearch) -> float:
     """Of the best window of all."""
     if s.deviance <= 0.0:
         return 0.0
-    halves = (search.stop - search.first + search.half_width - 1) / search.half_width
-    number = wp.float64(wp.max(halves - 1, 1))
+    number = wp.float64(wp.max((search.stop - search.first - 1) / search.half_width, 1))
     u = wp.float64(u01_open(sequence_word(begin_sequence(wp.uint64(s.state)))))
     best = wp.vec3d(s.best)
     return float(_significance(best[0], best[1], best[2], number, u, search.level_known))
