@@ -133,7 +133,7 @@ LINES = {
     "kernels/spadwarp_kernels": (50, 50),
     "kernels/analytic": (1650, 1676),
     "kernels/base": (950, 1229),
-    "kernels/detection": (1000, 1440),
+    "kernels/detection": (1000, 1439),
     "kernels/estimators": (1300, 1091),
     "kernels/optics": (1350, 2627),
     "kernels/photon": (850, 1224),
