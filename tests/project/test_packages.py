@@ -133,7 +133,7 @@ LINES = {
     "kernels/spadwarp_kernels": (50, 50),
     "kernels/analytic": (1650, 1676),
     "kernels/base": (950, 1229),
-    "kernels/detection": (1000, 1439),
+    "kernels/detection": (1000, 1440),
     "kernels/estimators": (1300, 1091),
     "kernels/optics": (1350, 2627),
     "kernels/photon": (850, 1224),
@@ -142,7 +142,7 @@ LINES = {
     "kernels/tally": (450, 1064),
     "kernels/transport": (1450, 1700),
     "kernels/water": (1350, 1635),
-    "kernels/worlds": (1600, 2165),
+    "kernels/worlds": (1600, 2156),
 }
 
 

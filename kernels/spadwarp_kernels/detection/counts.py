@@ -345,9 +345,7 @@ class FirstPhotons:
 #endif
 """)
 def _sparse() -> wp.float64:
-    """Mean counts in a bin below which waiting times are cheaper than a binomial draw: a warp waits for the lane with
-    the most counts."""
-    ...
+    """Mean counts of a bin below which waiting for each is cheaper than a binomial draw: a warp waits for all lanes."""
 
 
 @wp.func
