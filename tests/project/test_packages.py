@@ -142,7 +142,7 @@ LINES = {
     "kernels/tally": (450, 1064),
     "kernels/transport": (1450, 1700),
     "kernels/water": (1350, 1635),
-    "kernels/worlds": (1600, 2165),
+    "kernels/worlds": (1600, 2156),
 }
 
 

@@ -284,7 +284,10 @@ class ArrivalEstimator:
         search.min_significance = check.number("min_significance", min_significance, "[0, 1e6]")
         test = {"first": first, "stop": stop, "background": background if "profile" not in test else None, **test}
         self.test = DetectionTest(bins, self.device, half_width / 1.5 if width is None else width, **test)
-        search.half_width_of_window = self.test.half_width
+        search.half_width_of_window = wide = self.test.half_width
+        reach = max(search.half_width, taps.shape[1]) + 1 if min_significance > 0.0 else bins
+        self.background_bins = None if method == "matched" else (-wide - reach, 3 * wide + reach)
+        """Bins, from the first one of the best window on, in which a call reads the background."""
 
     def __call__(self, histogram: wp.array, arrival: wp.array, significance: wp.array | None = None) -> None:
         """Writes the arrival times of a histogram into `arrival`, float32 `[pixel]`, and of counts, where there is an

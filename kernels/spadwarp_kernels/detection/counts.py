@@ -25,9 +25,6 @@ wp.set_module_options({"enable_backward": False})
 
 _ONE = wp.constant(wp.uint32(1))
 
-# Mean counts in a bin below which waiting times are cheaper than a binomial draw.
-_SPARSE = wp.constant(wp.float64(2.0))
-
 EVENT_LIMIT = 2**27
 """Most detections of a pixel in one frame of the event-driven detector: random blocks are numbered in 28 bits."""
 
@@ -340,13 +337,24 @@ class FirstPhotons:
     block: wp.uint32  # of random numbers
 
 
+@wp.func_native("""
+#if defined(__CUDA_ARCH__)
+    return 0.25;
+#else
+    return 2.0;
+#endif
+""")
+def _sparse() -> wp.float64:
+    """Mean counts of a bin below which waiting for each is cheaper than a binomial draw: a warp waits for all lanes."""
+
+
 @wp.func
 def draw_bin(draws: FirstPhotons, hazard: float, seed: wp.uint64, id: wp.uint64) -> FirstPhotons:
     """The counts of the next bin; `id` names the pixel and frame."""
     draws.count = 0
     h = wp.float64(hazard)
     if h > wp.float64(0.0) and draws.left > 0:
-        if wp.float64(draws.left) * h < _SPARSE:
+        if wp.float64(draws.left) * h < _sparse():
             # Counts one by one: what passes between two of them is exponential, whatever bins it spans.
             if draws.waiting == 0:
                 draws.wait = _exponential(seed, id, PURPOSE_COUNTS, draws.block)

@@ -30,7 +30,7 @@ MIN_SIGNIFICANCE = 4.0
 COUNTS = (wp.int32, wp.int64)
 
 _LN10, _LN_2PI = wp.constant(wp.float64(math.log(10.0))), wp.constant(wp.float64(math.log(2.0 * math.pi)))
-_MANY, _LEAST = wp.constant(wp.float64(1.0e9)), wp.constant(wp.float64(1.0e-30))
+_MANY, _LEAST = wp.constant(1.0e9), wp.constant(1.0e-30)
 _TERMS = wp.constant(64)  # of a tail, before the rest of it counts as a geometric series, which it stays below
 _HASH_START, _HASH_FACTOR = wp.uint32(2166136261), wp.uint32(16777619)  # Fowler, Noll and Vo
 
@@ -56,14 +56,6 @@ def _deviance(n: Any, mean: Any, trials: Any):
     if n < trials:
         value += (trials - n) * log1p(-excess / (trials - mean))
     return value
-
-
-@wp.func
-def _counting(mean: Any, trials: Any, pulses: Any):
-    """Expected counts of so many pulses, each of which counts one of its photons at most; see `DetectionTest`."""
-    if pulses > type(mean)(0.0):
-        return -trials * expm1(-mean / pulses)
-    return mean
 
 
 @wp.func
@@ -105,29 +97,31 @@ def _significance(
 
 @wp.struct
 class WindowSearch:
-    """The best window of the bins of a pixel that have been offered so far, one after the other."""
+    """The best window of the bins of a pixel that have been offered so far, one after the other. In float32, whose
+    rounding is far below the noise of counts: of two windows that it confuses, either will do."""
 
-    pulses: wp.float64  # of the histogram, see `DetectionTest`; 0: any number of counts
-    total: wp.float64  # counts of the pixel, where the level is not known
-    level: wp.float64  # of the background
-    before: wp.float64  # counts before the window
-    last_n: wp.float64  # counts and background of the half before, and of this one
-    last_b: wp.float64
-    own_n: wp.float64
-    own_b: wp.float64
+    per_pulse: float  # 1 over the pulses of the histogram, see `DetectionTest`; 0: any number of counts
+    left: wp.float64  # of the pulses, those without a count before the window
+    total: float  # counts of the pixel, where the level is not known
+    level: float  # of the background
+    last_n: float  # counts and background of the half before, and of this one
+    last_b: float
+    own_n: float
+    own_b: float
     deviance: float  # of the best window
-    best: wp.vec3d  # its counts, mean photons, trials
+    best: wp.vec3  # its counts, mean, trials
     window: int  # its first bin
     begin: int  # first bin of this half
     state: wp.uint32  # hash of the counts
 
 
 @wp.func
-def begin_search(search: Windows, pixel: int) -> WindowSearch:
+def begin_search(search: Windows, pixel: int, pulses: wp.float64) -> WindowSearch:
     """The search in the bins from `search.first` on, with a known level."""
     s = WindowSearch()
-    s.pulses = search.pulses
-    s.level = ONE
+    s.per_pulse = wp.where(pulses > ZERO, float(ONE / pulses), 0.0)
+    s.left = pulses
+    s.level = 1.0
     s.window = search.first
     s.begin = search.first
     s.state = (_HASH_START ^ wp.uint32(pixel % search.pixels)) * _HASH_FACTOR
@@ -138,35 +132,31 @@ def begin_search(search: Windows, pixel: int) -> WindowSearch:
 def offer_bin(search: Windows, s: WindowSearch, k: int, count: wp.int64, background: float) -> WindowSearch:
     """The next bin, k in [first, stop), of a pixel; at the end of a half the window that it closes is looked at."""
     if count > wp.int64(0):
-        s.own_n += wp.float64(count)
+        s.own_n += float(count)
         s.state = (((s.state ^ wp.uint32(k)) * _HASH_FACTOR) ^ wp.uint32(count)) * _HASH_FACTOR
-    s.own_b += wp.float64(background)
+    s.own_b += background
     if k + 1 == wp.min(s.begin + search.half_width, search.stop):
         n = s.last_n + s.own_n
-        mean = wp.max((s.last_b + s.own_b) * s.level, _LEAST)
-        trials = wp.where(search.level_known, _MANY * (n + mean), s.total)
-        if s.pulses > ZERO:
-            trials = wp.max(s.pulses - s.before, n)
-        single = search.stop - search.first <= search.half_width
-        # Which window is the best, float32 tells: of two that it confuses, either will do.
-        found = float(n)
-        of = float(trials)
-        expected = _counting(float(mean), of, float(s.pulses))
-        excess = found - expected
-        # The deviance is at most the square of the excess over the variance: most windows end here.
-        bound = s.deviance * expected * (1.0 - expected / of)
-        if (s.begin > search.first or single) and excess > 0.0 and excess * excess > bound:
-            value = _deviance(found, expected, of)
-            if value > s.deviance:
-                s.deviance = value
-                s.best = wp.vec3d(n, mean, trials)
-                s.window = wp.max(s.begin - search.half_width, search.first)
+        if n > 0.0 and (s.begin > search.first or search.stop - search.first <= search.half_width):
+            mean = wp.max((s.last_b + s.own_b) * s.level, _LEAST)
+            trials = wp.where(search.level_known, _MANY * (n + mean), s.total)
+            if s.per_pulse > 0.0:
+                trials = wp.max(float(s.left), n)
+                mean = wp.max(-trials * expm1(-mean * s.per_pulse), _LEAST)
+            excess = n - mean
+            # The deviance is at most the square of the excess over the variance: most windows end here.
+            if excess > 0.0 and excess * excess > s.deviance * mean * (1.0 - mean / trials):
+                value = _deviance(n, mean, trials)
+                if value > s.deviance:
+                    s.deviance = value
+                    s.best = wp.vec3(n, mean, trials)
+                    s.window = wp.max(s.begin - search.half_width, search.first)
         s.begin = k + 1
-        s.before += s.last_n
+        s.left -= wp.float64(s.last_n)
         s.last_n = s.own_n
         s.last_b = s.own_b
-        s.own_n = ZERO
-        s.own_b = ZERO
+        s.own_n = 0.0
+        s.own_b = 0.0
     return s
 
 
@@ -175,11 +165,10 @@ def significance_of(search: Windows, s: WindowSearch) -> float:
     """Of the best window of all."""
     if s.deviance <= 0.0:
         return 0.0
-    halves = (search.stop - search.first + search.half_width - 1) / search.half_width
-    number = wp.float64(wp.max(halves - 1, 1))
+    number = wp.float64(wp.max((search.stop - search.first - 1) / search.half_width, 1))
     u = wp.float64(u01_open(sequence_word(begin_sequence(wp.uint64(s.state)))))
-    mean = wp.max(_counting(s.best[1], s.best[2], s.pulses), _LEAST)
-    return float(_significance(s.best[0], mean, s.best[2], number, u, search.level_known))
+    best = wp.vec3d(s.best)
+    return float(_significance(best[0], best[1], best[2], number, u, search.level_known))
 
 
 @memoised
@@ -196,14 +185,14 @@ def _significance_kernel(dtype: Any) -> wp.Kernel:
         pixel = first_pixel + wp.tid()
         background = search.background[pixel % search.background.shape[0]]
         last_column = background.shape[0] - 1
-        s = begin_search(search, pixel)
+        s = begin_search(search, pixel, search.pulses)
         for k in range(wp.where(search.pulses > ZERO, search.first, 0)):
-            s.before += wp.float64(counts[pixel, k])
+            s.left -= wp.float64(counts[pixel, k])
         if not search.level_known:
-            level = ZERO
+            level = float(0.0)
             for k in range(search.first, search.stop):
-                s.total += wp.float64(counts[pixel, k])
-                level += wp.float64(background[wp.min(k, last_column)])
+                s.total += float(counts[pixel, k])
+                level += background[wp.min(k, last_column)]
             s.level = s.total / wp.max(level, _LEAST)
         for k in range(search.first, search.stop):
             s = offer_bin(search, s, k, wp.int64(counts[pixel, k]), background[wp.min(k, last_column)])

@@ -87,7 +87,7 @@ class Sensor:
     bins: int
     pulse_energy: float  # [J]
     pulses: int
-    margin: int  # bins beside the first one of the best window in which an estimator reads the background
+    read: wp.vec2i  # bins, from the best window's first on, in which the estimator reads the background
     seed: wp.uint64
 
 
@@ -99,8 +99,8 @@ class PixelLight:
     path: float  # of its light [m], infinite where there is none
     start: float  # at which the gate opens [m of path]
     delay: float  # of the gate [bins]
-    water: float  # by which the table is multiplied
-    decay: float  # and by exp(-decay * path) [1/m]
+    water: float  # by which the table is multiplied in the first bin
+    decay: float  # and from bin to bin
     dark: float  # per pulse and bin
     row: int  # of the table
 
@@ -168,21 +168,20 @@ def _light(sensor: Sensor, row: int, world: int) -> PixelLight:
     values = sensor.values
     scattering = world_value(values.scattering, world, float(lidar.scattering))
     absorption = world_value(values.absorption, world, float(lidar.extinction - lidar.scattering))
-    light.decay = wp.where(
-        values.scattering.shape[0] + values.absorption.shape[0] > 0,
-        scattering + absorption - float(lidar.extinction),
-        0.0,
-    )
+    excess = float(0.0)  # extinction beyond the table's [1/m]
+    if values.scattering.shape[0] + values.absorption.shape[0] > 0:
+        excess = scattering + absorption - float(lidar.extinction)
     brightness = float(1.0)
     if values.pulse_energy.shape[0] > 0:
         brightness = world_value(values.pulse_energy, world, sensor.pulse_energy) / sensor.pulse_energy
-    light.water = brightness * scattering
     light.dark = sensor.dark
     if values.dark_rate.shape[0] > 0:
         light.dark = world_value(values.dark_rate, world, 0.0) * sensor.bin_path / float(lidar.speed)
     later = 2.0 * wp.max(world_value(values.gate_delay, world, 0.0), 0.0)
     light.delay = later / sensor.bin_path
     light.start = sensor.gate_start + later
+    light.water = brightness * scattering * wp.exp(-excess * (light.start + 0.5 * sensor.bin_path))
+    light.decay = wp.exp(-excess * sensor.bin_path)
     light.row = pixel % sensor.table.shape[0]
     light.path = wp.inf
     if distance > 0.0:
@@ -196,9 +195,7 @@ def _light(sensor: Sensor, row: int, world: int) -> PixelLight:
         value = radiometric_signal(lidar, _see(lidar.ports, u), r, wp.vec3d(n), reflectance)
         light.path = float(beam_path(lidar, r * u) + r)
         if value > wp.float64(0.0) and wp.isfinite(value):
-            light.signal = float(value) * brightness
-            if light.decay != 0.0:
-                light.signal *= wp.exp(-light.decay * light.path)
+            light.signal = float(value) * brightness * wp.exp(-excess * light.path)
     return light
 
 
@@ -210,7 +207,7 @@ def _below(z: float) -> float:
 
 @wp.func
 def _background(sensor: Sensor, light: PixelLight, k: int) -> float:
-    """The water's detections per pulse in a bin, where nothing is in the way."""
+    """The water's detections per pulse in a bin, where nothing is in the way, but for the decay from the first on."""
     value = float(0.0)
     if light.delay == 0.0:
         value = sensor.table[light.row, k]
@@ -219,10 +216,7 @@ def _background(sensor: Sensor, light: PixelLight, k: int) -> float:
         j = wp.min(int(place), sensor.table.shape[1] - 2)
         after = wp.min(place - float(j), 1.0)
         value = (1.0 - after) * sensor.table[light.row, j] + after * sensor.table[light.row, j + 1]
-    value *= light.water
-    if light.decay != 0.0:
-        value *= wp.exp(-light.decay * (light.start + (float(k) + 0.5) * sensor.bin_path))
-    return value
+    return value * light.water
 
 
 @wp.func
@@ -236,7 +230,8 @@ def _expected(sensor: Sensor, light: PixelLight, k: int, water: float) -> float:
     if low > 9.0:
         return light.dark
     # From the side on which both are small, where a difference keeps its digits.
-    surface = wp.where(low > 0.0, _below(-low) - _below(-high), _below(high) - _below(low)) * light.signal
+    side = wp.where(low > 0.0, -1.0, 1.0)
+    surface = side * (_below(side * high) - _below(side * low)) * light.signal
     return light.dark + water * _below(-0.5 * (low + high)) + wp.max(surface, 0.0)
 
 
@@ -278,8 +273,8 @@ def _frame_kernel(traced: bool) -> wp.Kernel:
         id = wp.uint64(sensor.step[0]) * wp.uint64(sensor.images.counts.shape[0]) + wp.uint64(row)
         draws = FirstPhotons()
         draws.left = pulses
-        search = begin_search(windows, row)
-        search.pulses = wp.float64(pulses)
+        search = begin_search(windows, row, wp.float64(pulses))
+        decay = float(1.0)
         for k in range(histogram.shape[1]):
             level = float(0.0)
             rate = float(0.0)
@@ -287,7 +282,8 @@ def _frame_kernel(traced: bool) -> wp.Kernel:
                 level = water[i, k]
                 rate = rates[i, k]
             else:
-                level = _background(sensor, light, k)
+                level = _background(sensor, light, k) * decay
+                decay *= light.decay
                 rate = _expected(sensor, light, k, level)
                 if rates.shape[0] > 0:
                     rates[i, k] = rate
@@ -298,9 +294,11 @@ def _frame_kernel(traced: bool) -> wp.Kernel:
         sensor.images.significance[row] = significance_of(windows, search)
         window[i] = search.window
         if known.shape[0] > 0:
-            low = wp.max(search.window - sensor.margin, 0)
-            for k in range(low, wp.min(search.window + sensor.margin, histogram.shape[1])):
-                level = water[i, k] if wp.static(traced) else _background(sensor, light, k)
+            low = wp.max(search.window + sensor.read[0], 0)
+            decay = wp.pow(light.decay, float(low))
+            for k in range(low, wp.min(search.window + sensor.read[1], histogram.shape[1])):
+                level = water[i, k] if wp.static(traced) else _background(sensor, light, k) * decay
+                decay *= light.decay
                 known[i, k] = float(pulses) * (level + light.dark)
 
     return frame
@@ -524,8 +522,8 @@ class WorldCameras:
         taps = {"response": response, "lowest_tap": lowest_tap, "half_width": -lowest_tap - 1}
         taps |= {"min_significance": config.min_significance, "width": 2.355 * config._sigma_bins}
         self._estimate = ArrivalEstimator(bins, device, config.method, known, **taps, pulses=config.pulses)
-        margin = 4 * self._estimate.test.half_width + 2 * response.shape[1]
-        sensor.margin = margin if config.min_significance > 0.0 else bins
+        read = self._estimate.background_bins
+        sensor.read = wp.vec2i(*(read or (0, 0)))
         rates, counts = (
             each.reshape((self._rows, bins)) if each.size else None for each in (self.rates, self.histogram)
         )
@@ -538,7 +536,7 @@ class WorldCameras:
         rows = max(_ROWS // len(self._lines), 1) * len(self._lines)
         most = min(rows, self._rows)
         scratch = self._matrix(most, int) if counts is None else None
-        known = self._matrix(most) if self._by_world or self.traced else None
+        known = self._matrix(most) if read and (self._by_world or self.traced) else None
         window, arrival = wp.empty(most, dtype=int, device=device), wp.empty(most, dtype=float, device=device)
         self._launches = []
         for start in range(0, self._rows, rows):

@@ -62,10 +62,7 @@ class SpadConfig:
     """3 x 3 in its place, as of OpenCV, ROS and Isaac Lab: (f_x, 0, c_x), (0, f_y, c_y), (0, 0, 1) [pixels], where the
     first pixel's centre is (0, 0). To read: `SpadCamera.camera_matrix`."""
     bins: int = 256  # time bins of a histogram
-    gate_distance: tuple[float, float] = (
-        0.5,
-        10.0,
-    )  # least and largest one-way distance in this water that is recorded [m]
+    gate_distance: tuple[float, float] = (0.5, 10.0)  # one way in this water: least and largest recorded [m]
     pulses: int = 20_000  # of a frame
     pulse_energy: float = 2e-9  # [J]
     wavelength: float = 532e-9  # [m]
@@ -104,10 +101,8 @@ class SpadConfig:
         check.choice("config.method", self.method, ("centroid", "peak", "matched", "likelihood"))
         check.integer("config.seed", self.seed, 0, 2**64 - 1)
         if (bins := self._sigma_bins) > 1e4:
-            width = f"bins of {self.bin_path / self.speed:.3g} s"
-            raise ArgumentError(
-                f"config.timing_sigma = {self.timing_sigma} s is {bins:.3g} {width}; 10000 are possible"
-            )
+            found = f"{self.timing_sigma} s is {bins:.3g} bins of {self.bin_path / self.speed:.3g} s"
+            raise ArgumentError(f"config.timing_sigma = {found}; 10000 are possible")
 
     def _check_field_of_view(self) -> None:
         found = [name for name in _FIELDS_OF_VIEW if getattr(self, name) is not None]
@@ -165,11 +160,9 @@ class SpadConfig:
         if self.laser_half_angle is not None:
             return float(self.laser_half_angle)
         k = self.intrinsics
-        x, y = (
-            max(c + 0.5, n - 0.5 - c) / f
-            for c, n, f in ((k[0, 2], self.width, k[0, 0]), (k[1, 2], self.height, k[1, 1]))
-        )
-        return min(1.1 * math.atan(math.hypot(x, y)), 0.5 * math.pi)
+        sizes = enumerate((self.width, self.height))
+        corner = [max(k[i, 2] + 0.5, n - 0.5 - k[i, 2]) / k[i, i] for i, n in sizes]
+        return min(1.1 * math.atan(math.hypot(*corner)), 0.5 * math.pi)
 
     @property
     def photons(self) -> float:
