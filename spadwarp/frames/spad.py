@@ -464,10 +464,8 @@ def detect(
 ) -> Frames:
     """Frames of counts that the camera would record.
 
-    First-photon counts are exact multinomials, drawn bin after bin as binomials at a cost that does not depend on
-    `pulses`. Free-running, first-photon with afterpulsing, and time tags are followed event by event, at a cost per
-    detection. Crosstalk enters as a mean: λ gains `crosstalk_probability` times the expected detections of each of the
-    four neighbours in the same bin; that its counts come in pairs is left out. Dead time acts in free-running mode.
+    First-photon counts are exact multinomials, at a cost that does not depend on `pulses`. Free-running, first-photon
+    with afterpulsing, and time tags are followed event by event, at a cost per detection. Crosstalk enters as a mean.
 
     The light of a Result has the noise of the simulation, which is drawn as if it were light, the same in every frame:
     a warning says where it shows beside that of the photons (`Result.target_noise_ratio`), a note that it is not known.
