@@ -18,10 +18,10 @@ from spadwarp.device import cuda_driver, devices, nvidia_driver, pick_device
 from spadwarp.scene import Scene
 from spadwarp.transport import simulate
 from spadwarp.validate import references
-from spadwarp.validate.cases import PENCIL, Estimate, Quantity, Run, scene, slab_faces
+from spadwarp.validate.cases import PENCIL, CaseResult, Estimate, Quantity, Run, judged, scene, slab_faces
 from spadwarp.values import EXTRAS, __version__, guarded
 
-__all__ = ["Diagnosis", "SelfTest", "diagnose"]
+__all__ = ["Diagnosis", "diagnose"]
 
 NEEDED = ["warp-lang", "numpy", "scipy", "trimesh", "manifold3d", "OpenEXR", "pydantic", "typer", "h5py", "matplotlib"]
 NEEDED += ["tomli-w", "PyYAML", "jinja2"]
@@ -36,7 +36,7 @@ class Diagnosis:
     facts: dict[str, dict[str, str]]  # section → name → value, as text
     gpu: list[str]  # why no GPU is used and what to do about it; empty with a GPU
     problems: list[str]  # what keeps spadwarp from working
-    tests: list[SelfTest]  # empty if they were not run
+    tests: list[CaseResult]  # empty if they were not run
     seconds: dict[str, float]  # of the self-test: `compile` (or load) the kernels, `run`
 
     @property
@@ -150,28 +150,11 @@ def _gpu_reasons() -> list[str]:
 
 # Self-test: two small scenes whose answer is known
 
-_LARGEST_Z = 4.5  # a correct simulator exceeds it once in 150 000 tests
+_LEVEL = 1e-5  # probability that a correct simulator fails
 _PHOTONS = 400_000
 
 
-@dataclass(frozen=True)
-class SelfTest:
-    """A measured value beside its known value; passed if they differ by less than 4.5 standard errors."""
-
-    name: str
-    value: float
-    reference: float
-    standard_error: float
-    passed: bool
-
-    def __str__(self) -> str:
-        verdict = "ok" if self.passed else "FAILED"
-        if not self.standard_error:
-            return f"{self.value:g} ({verdict})"
-        return f"{self.value:.5f} ± {self.standard_error:.5f}, known: {self.reference:.5f} ({verdict})"
-
-
-def _run_self_test(device: str, progress: Callable[[str], None]) -> tuple[list[SelfTest], dict[str, float]]:
+def _run_self_test(device: str, progress: Callable[[str], None]) -> tuple[list[CaseResult], dict[str, float]]:
     """The tests, and the seconds that it took to `compile` or load the kernels and to `run`."""
     progress("loading kernels; the first time they are compiled")
     began = time.perf_counter()
@@ -179,8 +162,8 @@ def _run_self_test(device: str, progress: Callable[[str], None]) -> tuple[list[S
     ready = time.perf_counter()
     progress("tracing")
     found = _quantities(device, _PHOTONS)
-    tests = [SelfTest(q.name, q.estimate.value, q.reference, q.standard_error, abs(q.z) < _LARGEST_Z) for q in found]
-    return tests, {"compile": ready - began, "run": time.perf_counter() - ready}
+    seconds = {"compile": ready - began, "run": time.perf_counter() - ready}
+    return judged([(one.name, one) for one in found], _LEVEL), seconds
 
 
 def _quantities(device: str, photons: int) -> list[Quantity]:

@@ -71,8 +71,6 @@ def detect(
     if pixel is not None and not (0 <= pixel[0] < scene.camera.height and 0 <= pixel[1] < scene.camera.width):
         wrong(f"{pixel[0]} {pixel[1]} is outside 0 0 to {scene.camera.height - 1} {scene.camera.width - 1}", "--pixel")
     shots = scene.detector.pulses_per_frame if pulses is None else pulses
-    if problem := spadwarp.result.noise_problem(_with_detector(result, [f"detector.pulses_per_frame={shots}"])):
-        complain(problem, "note")
     counted = min(shots, bins) if scene.detector.mode == "first_photon" else bins
     needed = max(frames, 0) * scene.camera.width * scene.camera.height * (4 * counted + 4 * len(methods) + 8)
     check_outputs(out, ("frames.h5", "frame.png"), inputs=(run,), needed=needed + (16 << 20))
@@ -131,7 +129,7 @@ def _recorded(recording: Recording, frames: int) -> dict[str, Any]:
             "noise_fraction": noise if math.isfinite(noise) else None,
         },
         "depth": {name: dataclasses.asdict(error) for name, error in recording.errors.items()},
-        "monte_carlo_noise": None if recording.monte_carlo is None else dataclasses.asdict(recording.monte_carlo),
+        "noise_ratio": file.target_noise_ratio,
         "notes": list(file.notes),
     }
 

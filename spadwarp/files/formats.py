@@ -1,9 +1,11 @@
-"""Frames of any source, one at a time, and all that there is in the formats of other programs."""
+"""Frames of any source, one at a time, and all that there is in the formats of other programs: of lidars single photons
+with position and truth, as a table or a LAS file, and waveforms of each shot, too."""
 
 from __future__ import annotations
 
 import os
 import shutil
+import struct
 import tempfile
 import warnings
 from collections.abc import Callable, Mapping
@@ -16,24 +18,28 @@ import numpy as np
 from numpy.typing import NDArray
 
 from spadwarp.analytic import AnalyticFile
-from spadwarp.arrays import on_host
+from spadwarp.arrays import Floats, on_host
 from spadwarp.dataset import FrameReader
 from spadwarp.dataset.recipe import SPLITS
-from spadwarp.files.lidar import LIDAR_FORMATS, write_lidar
 from spadwarp.files.loader import load, locate
-from spadwarp.frames import Frames, FramesFile, SequenceFile
+from spadwarp.frames import Frames, FramesFile, Receiver, SequenceFile, detect
 from spadwarp.io.arrays import write_array, write_exr
 from spadwarp.io.paths import atomic_path, write_file
 from spadwarp.io.text import write_text
 from spadwarp.result import Channel, analyser_channel
+from spadwarp.result.file import exr_notes
 from spadwarp.result.result import Result
-from spadwarp.scene import Scene, noise_rate
-from spadwarp.scene.camera import CALIBRATION_ENDINGS, save_calibration
+from spadwarp.scene import Scene, noise_rate, shots_of
+from spadwarp.scene.camera import CALIBRATION_ENDINGS, save_calibration, to_world
 from spadwarp.scene.sight import lines_of_sight
-from spadwarp.transport import truth_maps
-from spadwarp.values import ArgumentError, FileError, check_choice, check_integer, time_from_path
+from spadwarp.transport import target_map, truth_maps
+from spadwarp.values import ArgumentError, FileError, check_choice, check_integer, path_from_time, time_from_path
 
-__all__ = ["FORMATS", "export", "export_sensor_fusion", "open_source", "sequence"]
+__all__ = ["FORMATS", "LIDAR_FORMATS", "PhotonCloud", "export", "export_sensor_fusion", "open_source", "photon_cloud"]
+__all__ += ["sequence", "write_lidar"]
+
+LIDAR_FORMATS = (".parquet", ".las", ".laz", ".wdp")
+"""Endings of the files that `write_lidar` writes."""
 
 FORMATS = (".npy", ".npz", ".png", ".mat", ".ptu", ".exr", ".zarr", *LIDAR_FORMATS, *CALIBRATION_ENDINGS)
 """Endings of the files that `export` writes."""
@@ -246,29 +252,8 @@ def export(
 ) -> list[Path]:
     """Writes a result, frames or a dataset in another program's format, which the ending of `path` selects.
 
-    - `.npy`: a result's expected histogram `[H, W, T]` (fraction of the emitted photons); counts `[H, W, T]`, of many
-      frames `[frames, H, W, T]`; where there is depth alone, as in datasets of the analytic simulator, depth `[H, W]`
-      or `[frames, H, W]` [m].
-    - `.npz`: the same as `histogram`, `counts` or `depth`, with its axis `time` [s], the bins' centres, `bin_width` and
-      `gate_start` [s], and `true_depth` [m] where it is one.
-    - `.png`: depth of one frame in whole millimetres, 16 bits, 0 without one or beyond 65.535 m, as OpenCV and ROS
-      (`16UC1`) read it.
-    - `.mat`: counts of one frame as the simulated data that single-photon denoisers train on (Lindell et al. 2018):
-      `spad` sparse `[W·H, T]`, whose row is y + H·x; `rates` `[H, W, T]`, the expected counts that `spad` was drawn
-      from; `bin` `[H, W]`, the bin of the true time of flight counted from 1, 0 without one; `bin_size` [s]; `depth`
-      [m], 0 without a target; `intensity` in [0, 1]; `SBR`; `mean_signal_photons` and `mean_background_photons` of a
-      pixel. Also under the names that some readers know: `range_bins` for `bin`, `photons` for `mean_signal_photons`.
-    - `.ptu`: counts as a T3 image of PicoQuant, one record a detection, the frames one after the other. Times start at
-      the window's start, which the comment of the file states, as behind a delayed sync.
-    - `.exr`: images of one frame: depth `Z` [m], `intensity`, `truth.Z` and what else the source has: components of a
-      result, `<method>.Z` of each estimator, `background` where the pixel reports it, the bound of the depth.
-    - `.zarr`: a result as `Result.to_xarray` has it, with its flux: a folder that `xarray.open_zarr` opens.
-    - `.parquet`, `.las`, `.laz`: single photons of one frame that the result's detector draws, see
-      `spadwarp.files.photon_cloud`: a table with a row, or LAS 1.4 with a point (format 6, GPS time) for each, in the
-      world [m]; the classes are those of ASPRS: 40 what met a target, 41 the surface, 45 the
-      water column, 7 noise.
-    - `.wdp`: the waveform of each pixel, counts of its bins, and beside it `.las` (format 9) with a point at its peak.
-    - `.xml`, `.yml`, `.yaml`, `.json`: the camera's calibration, as OpenCV's `cv::FileStorage` reads it.
+    `.npy`, `.npz`, `.png`, `.mat`, `.ptu`, `.exr`, `.zarr`, `.parquet`, `.las`, `.laz`, `.wdp`; the calibration of the
+    camera as `.xml`, `.yml`, `.yaml`, `.json`. What they hold: docs/formats.md, "Other programs' formats".
 
     Args:
         source: A `Result`, `Frames`, the file of one (`result.h5`, `frames.h5`, `analytic.h5`), or the folder of a
@@ -426,7 +411,7 @@ def _write_result(result: Result, path: Path, ending: str, frames: Any) -> Path:
         channels |= {f"truth.{name}": getattr(truth, field) for name, field in _TRUTH_CHANNELS.items()}
         channels |= {f"truth.N.{axis}": truth.normal[..., index] for index, axis in enumerate("XYZ")}
         content = "expected depth (centroid), fractions of the light"
-        return write_exr(path, channels, _exr_metadata(result.scene, content))
+        return write_exr(path, channels, exr_notes(content, result.scene))
     raise ArgumentError(
         f"a result holds expected histograms, and {ending} is for counts: draw frames first (`spadwarp detect`)"
     )
@@ -601,12 +586,213 @@ def _write_exr_frame(frames: FrameSequence, path: Path, number: int) -> Path:
     for name, image in frame.images.items():  # EXR's integers have no sign, and few programs show them
         channels[name] = image.astype(np.float32) if image.dtype.kind in "iu" else image
     content = f"frame {number} of {frames.count}" + (f", {frame.content}" if frame.content else "")
-    return write_exr(path, channels, _exr_metadata(frame.scene, content))
+    return write_exr(path, channels, exr_notes(content, frame.scene))
 
 
-def _exr_metadata(scene: Scene | None, content: str) -> dict[str, str | int | float]:
-    """Metadata of an EXR image of depth."""
-    metadata: dict[str, str | int | float] = {"content": content, "Z": "planar depth [m]"}
-    if scene is not None:
-        metadata |= {"pixel_tangent": scene.camera.pixel_tangent, "config": scene.to_toml()}
-    return metadata
+# What a lidar delivers
+
+NOISE = "noise"
+
+# Classes of ASPRS for bathymetry: 40 bottom or object, 41 water surface, 45 water column, 7 noise.
+_CLASSES = {"surface": 41, "ballistic": 40, "forward_scattered": 40, "backscatter": 45, NOISE: 7}
+
+_COORDINATE = 1e-4  # unit of coordinates in a LAS file [m]
+_HEADER = 60  # bytes of the record that a file of waveforms begins with
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class PhotonCloud:
+    """Detections one by one, in the order of shot and time: arrays `[N]`."""
+
+    shot: NDArray[np.int32]  # number of the shot, from 0; without a scan 0
+    row: NDArray[np.int32]  # of the pixel that has it
+    column: NDArray[np.int32]
+    pulse: NDArray[np.int64]  # number of the pulse in the shot
+    time: Floats  # when the pulse was emitted, from the first pulse of all on [s]
+    time_of_flight: Floats  # middle of the bin [s]
+    position: Floats  # on the line of sight of its pixel at that time of flight, in the world [m], `[N, 3]`
+    component: NDArray[np.int8]  # index into `components`: where it is from
+    components: tuple[str, ...]  # those of a result, and "noise": dark counts, ambient light, crosstalk
+    target: NDArray[np.int32]  # the target on the line of sight, from 0; -1 for none
+    true_range: NDArray[np.float32]  # of that target [m]; NaN for none
+
+    def __len__(self) -> int:
+        return len(self.shot)
+
+    def columns(self) -> dict[str, NDArray[Any]]:
+        """The columns of the table; `component` as text."""
+        arrays = {name: array for name, array in vars(self).items() if name not in ("position", "components")}
+        arrays |= dict(zip("xyz", self.position.T, strict=True))
+        return arrays | {"component": np.array(self.components)[self.component]}
+
+
+def photon_cloud(result: Result, *, seed: int = 0, device: str | None = None) -> PhotonCloud:
+    """The detections of one frame of a result's detector, each with its position and the component it is from.
+
+    Detections are those of `spadwarp.detect` with dead time, pile-up, jitter and noise. A detector does not tell
+    photons apart, so that one at a time is of each component with the share that this has of the expected detections
+    there; what afterpulses follow gives them its share. Where the detector's time wraps, positions are those of the
+    first period.
+
+    Raises what `detect` and `shots_of` raise.
+    """
+    frames = detect(result, seed=seed, tags=True, device=device)
+    assert frames.tags is not None
+    _, row, column, pulse, tag_bin = frames.tags
+    scene, at = result.scene, (row, column)
+    middle = frames.gate_start + 0.5 * (frames.edges[:-1] + frames.edges[1:])
+    flight = middle[tag_bin]
+    shot = _shot_numbers(result)[at]
+    emitted = (shot * float(frames.pulses) + pulse) / scene.laser.repetition_rate
+    return PhotonCloud(
+        shot=shot,
+        row=row.astype(np.int32),
+        column=column.astype(np.int32),
+        pulse=pulse.astype(np.int64),
+        time=np.asarray(emitted, np.float64),
+        time_of_flight=flight,
+        position=_positions(result, at, flight),
+        component=_components(result, frames, (*at, tag_bin), seed),
+        components=(*scene.components, NOISE),
+        target=target_map(scene, device=device)[at],
+        true_range=result.truth.range[at],
+    )
+
+
+def _shot_numbers(result: Result) -> NDArray[np.int32]:
+    """The shot in which each pixel sees, `[H, W]`."""
+    scene, (height, width) = result.scene, result.truth.depth.shape
+    number = np.arange(height * width) // (height * width // scene.scan_positions)
+    return number.reshape(height, width).astype(np.int32)
+
+
+def _positions(result: Result, at: tuple[Any, Any], flight: Floats) -> Floats:
+    """Points of the world [m] on the lines of sight of pixels at times of flight, or where these lines begin."""
+    scene = result.scene
+    lines = lines_of_sight(scene)[at]
+    ranges = lines.range_from_path(path_from_time(flight, scene.medium.group_index))
+    points = lines.points(np.where(np.isnan(ranges), lines.lead, ranges))
+    if scene.scan.mode != "trajectory":
+        return to_world(scene.camera, points)
+    shots, number = shots_of(scene), _shot_numbers(result)[at]
+    return np.einsum("nij,nj->ni", shots.rotation[number], points) + shots.position[number]
+
+
+def _components(result: Result, frames: Frames, at: tuple[Any, Any, Any], seed: int) -> NDArray[np.int8]:
+    """Drawn for detections in voxels, by what each component and the noise are expected to bring there."""
+    import warp as wp
+
+    scene = result.scene
+    scale, gate = scene.laser.photons_per_pulse * scene.detections_per_photon, scene.gate
+    axis, shape = (gate.start, gate.bin_width), result.truth.depth.shape
+    choices: dict[str, Any] = {"shape": (*shape, gate.bins), "axis": axis, "device": wp.get_device("cpu")}
+    receiver = Receiver.of(scene.detector, scene.laser, irf=frames.irf, **choices)
+    dark = wp.zeros(shape[0] * shape[1], dtype=wp.float32, device="cpu")
+    left = np.random.Generator(np.random.Philox(key=[seed, 0x70686F74])).random(len(at[0])) * frames.expected[at]
+    noise = len(scene.components)
+    component = np.full(len(left), noise, np.int8)
+    for number, name in enumerate(scene.components):
+        light = (result.expected(name) * scale).astype(np.float32).reshape(-1, gate.bins)
+        rows: Any = wp.array(light, device="cpu")
+        share = receiver.light(rows, dark).numpy().reshape(*shape, -1)[at]
+        component[(component == noise) & (left < share)] = number
+        left = left - share
+    return component
+
+
+def write_lidar(result: Result, path: Path, *, seed: int = 0) -> list[Path]:
+    """Writes what a lidar delivers of one frame of a result; the ending of `path` selects it, see `spadwarp.export`.
+
+    Returns the files. Raises `ArgumentError`: no detection, or bins that a file of waveforms cannot have.
+    """
+    ending = path.suffix.lower()
+    if ending == ".wdp":
+        return _write_waveforms(result, path, seed)
+    cloud = photon_cloud(result, seed=seed)
+    if not len(cloud):
+        raise ArgumentError("no photon was detected: more pulses (detector.pulses_per_frame), or a brighter laser")
+    if ending == ".parquet":
+        import pyarrow
+        import pyarrow.parquet
+
+        return [write_file(path, partial(pyarrow.parquet.write_table, pyarrow.table(cloud.columns())))]
+    return [_write_las(cloud, path)]
+
+
+def _las_header(point_format: int, points: Floats) -> Any:
+    import laspy
+
+    header = laspy.LasHeader(version="1.4", point_format=point_format)
+    header.scales, header.offsets = np.full(3, _COORDINATE), np.floor(points.min(axis=0))
+    header.global_encoding.wkt = True
+    header.generating_software = "spadwarp"
+    return header
+
+
+def _write_las(cloud: PhotonCloud, path: Path) -> Path:
+    """A point for each photon, format 6."""
+    import laspy
+
+    header = _las_header(6, cloud.position)
+    extra = {name: getattr(cloud, name) for name in ("shot", "pulse", "time_of_flight", "component", "target")}
+    header.add_extra_dims([laspy.ExtraBytesParams(name=name, type=array.dtype) for name, array in extra.items()])
+    las = laspy.LasData(header)
+    las.x, las.y, las.z = cloud.position.T
+    las.gps_time = cloud.time
+    las.classification = np.array([_CLASSES[name] for name in cloud.components], np.uint8)[cloud.component]
+    las.return_number, las.number_of_returns = _returns(cloud)
+    for name, array in extra.items():
+        las[name] = array
+    return write_file(path, lambda file: las.write(file, do_compress=path.suffix.lower() == ".laz"))
+
+
+def _returns(cloud: PhotonCloud) -> tuple[NDArray[np.uint8], NDArray[np.uint8]]:
+    """Number of each photon among those of its pixel and pulse, from 1, and how many there are; 15 at most."""
+    of_pulse = np.stack([cloud.row, cloud.column, cloud.pulse])
+    first = np.append(True, (np.diff(of_pulse, axis=1) != 0).any(axis=0))
+    begin = np.flatnonzero(first)
+    count = np.diff(np.append(begin, len(cloud)))
+    number = np.arange(len(cloud)) - np.repeat(begin, count) + 1
+    return np.minimum(number, 15).astype(np.uint8), np.minimum(np.repeat(count, count), 15).astype(np.uint8)
+
+
+def _write_waveforms(result: Result, path: Path, seed: int) -> list[Path]:
+    """A point, format 9, at the fullest bin of each pixel that has counts, and beside it the counts of all its bins."""
+    import laspy
+
+    scene, frames = result.scene, detect(result, seed=seed, tags=True)  # the same as of the photons
+    spacing = 1e12 * frames.bin_width
+    if abs(spacing - round(spacing)) > 1e-6 * spacing:
+        text = f"gate.bin_width_ps = {spacing:.6g}: samples of a LAS file are whole picoseconds apart"
+        raise ArgumentError(text)
+    counts = frames.counts[0]
+    at: tuple[Any, Any] = np.nonzero(counts.any(axis=2))  # type: ignore[assignment]
+    if not len(at[0]):
+        raise ArgumentError("no photon was detected: more pulses (detector.pulses_per_frame), or a brighter laser")
+    samples = counts[at].astype("<u4" if counts.max() > 0xFFFF else "<u2")
+    peak = samples.argmax(axis=1)
+    flight = frames.gate_start + (peak + 0.5) * frames.bin_width
+    points = _positions(result, at, flight)
+    header = _las_header(9, points)
+    header.global_encoding.waveform_data_packets_external = True
+    descriptor = laspy.vlrs.known.WaveformPacketVlr(100, "counts of time bins")
+    fields = (8 * samples.itemsize, 0, samples.shape[1], round(spacing), 1.0, 0.0)
+    descriptor.parse_record_data(struct.pack("<BBIIdd", *fields))
+    header.vlrs.append(descriptor)
+    las = laspy.LasData(header)
+    las.x, las.y, las.z = points.T
+    shot, size = _shot_numbers(result)[at], samples.shape[1] * samples.itemsize
+    las.gps_time = shot * (frames.pulses / scene.laser.repetition_rate)
+    las.intensity = np.minimum(samples.max(axis=1), 0xFFFF)
+    las.return_number = las.number_of_returns = np.ones(len(shot), np.uint8)
+    las.wavepacket_index = np.ones(len(shot), np.uint8)
+    las.wavepacket_offset = _HEADER + size * np.arange(len(shot), dtype=np.uint64)
+    las.wavepacket_size = np.full(len(shot), size, np.uint32)
+    las.return_point_wave_location = (peak + 0.5) * spacing
+    # Along the line of sight, as fast as the light of the last two bins there and back.
+    end: Floats = np.full(len(peak), frames.gate_start + frames.edges[-1])
+    step = _positions(result, at, end) - _positions(result, at, end - frames.bin_width)
+    las.x_t, las.y_t, las.z_t = (step / spacing).T
+    head = struct.pack("<H16sHQ32s", 0, b"LASF_Spec", 65535, samples.nbytes, b"waveform data packets")
+    write_file(path, lambda file: file.write(head + samples.tobytes()))
+    return [write_file(path.with_suffix(".las"), partial(las.write, do_compress=False)), path]

@@ -15,6 +15,7 @@ from spadwarp.arrays import on_host
 from spadwarp.checks import summary as scene_summary
 from spadwarp.dataset import FrameReader
 from spadwarp.frames import Frames, FramesFile, Reduction, SequenceFile
+from spadwarp.frames.measured import is_own
 from spadwarp.io.hdf5 import read_hdf5
 from spadwarp.io.paths import file_within
 from spadwarp.result import Result, Truth, load_result
@@ -40,33 +41,23 @@ _LOADERS: dict[str, Callable[[Path], Held]] = {
 
 
 def load(path: str | os.PathLike[str]) -> Held:
-    """Loads a file that spadwarp wrote.
+    """Loads a file that spadwarp wrote: what each gives (`Held`) stands in docs/formats.md, "One loader".
 
-    - `result.h5`, `checkpoint.h5`: a `Result`.
-    - `frames.h5` of `detect`: a `FramesFile`, which reads counts and depth when asked.
-    - `analytic.h5`: an `AnalyticFile`, likewise.
-    - A dataset's folder or one of its shards: a `FrameReader` of all its frames.
-    - `records.h5`: `PhotonRecords`.
-    - `sequence.h5` of `simulate --trajectory`: a `SequenceFile`, which reads frames of a scene that moves when asked.
-    - A directory with one of these files, such as that of a run: the same. A checkpoint counts if there is no result.
-
-    Raises `FileError`: not a file of ours, damaged, or a directory that holds none or several of them.
+    A directory with one of these files, such as that of a run, is as the file; a checkpoint counts if there is no
+    result; of a dataset's folder or a shard all frames. Raises `FileError`: not a file of ours, damaged, or a directory
+    that holds none or several of them.
     """
     place = locate(path)
-    kind, is_shard = (None, True) if place.is_dir() else _format(place)
-    if is_shard:
+    kind, is_dataset = None, place.is_dir()
+    if not is_dataset:
+        with read_hdf5(place) as file:
+            kind, is_dataset = file.attribute("format", None), file.attribute("shard", None) is not None
+    if is_dataset:
         return FrameReader(place, "all")
-    loader = _LOADERS.get(kind) if isinstance(kind, str) else None
-    if loader is None:
+    if (loader := _LOADERS.get(str(kind))) is None:
         known = ", ".join(_LOADERS)
         raise FileError(f"{place}: an HDF5 file, but none of ours: its format is {kind!r}, not one of {known}")
     return loader(place)
-
-
-def _format(path: Path) -> tuple[Any, bool]:
-    """The format of an HDF5 file, and whether it is a shard of a dataset."""
-    with read_hdf5(path) as file:
-        return file.attribute("format", None), file.attribute("shard", None) is not None
 
 
 def locate(path: str | os.PathLike[str]) -> Path:
@@ -90,10 +81,7 @@ def holds_own_file(folder: str | os.PathLike[str]) -> bool:
 def is_own_file(place: Path) -> bool:
     """Whether a path from `locate` is a dataset's folder, or an HDF5 file that spadwarp wrote; raises `FileError` for a
     damaged one."""
-    if place.is_dir() or place.suffix.lower() not in (".h5", ".hdf5"):
-        return place.is_dir()
-    kind, is_shard = _format(place)
-    return is_shard or (isinstance(kind, str) and kind.startswith("spadwarp"))
+    return place.is_dir() or is_own(place)
 
 
 def stored_depth(held: Held) -> Reduction | None:

@@ -83,9 +83,8 @@ def arrival_time(
         gate_start: Time of the lower edge of bin 0 [s].
         bin_width: [s], > 0.
         method: `"peak"`: centre of the largest bin. `"centroid"`: mean about the peak, over ± 1.5 FWHM of `irf` (± 3
-            bins without one). `"matched"`: log-matched filter, argmax over μ of Σ n_k ln h_k(μ): maximum likelihood
-            where there is no background. `"likelihood"`: argmax over μ and the signal S of
-            Σ n_k ln(S·h_k(μ) + B_k) − S·Σ h_k(μ), B = `background`. The last two resolve fractions of a bin.
+            bins without one). `"matched"`: log-matched filter; `"likelihood"`: maximum likelihood, of background too
+            (eq T3). The last two resolve fractions of a bin.
         irf: The response. Needed by `"matched"` and `"likelihood"`; `"peak"` and `"centroid"` subtract its mode and its
             mean.
         device: Warp device; default: where the array lies, for NumPy the first GPU or else the CPU.

@@ -16,7 +16,7 @@ from spadwarp.device import pick_devices
 from spadwarp.frames.cramer_rao import ResultBound, bound_of_result, photons_for_noise
 from spadwarp.frames.depth import METHODS, Method
 from spadwarp.frames.response import InstrumentResponse, detector_response
-from spadwarp.frames.spad import Frames, MonteCarloNoise, detect, monte_carlo_noise
+from spadwarp.frames.spad import Frames, detect
 from spadwarp.io.hdf5 import (
     PACKED,
     PIXELS,
@@ -27,6 +27,7 @@ from spadwarp.io.hdf5 import (
     read_hdf5,
     write_hdf5,
 )
+from spadwarp.result.noise import with_frames
 from spadwarp.result.result import ARRAYS, Result, Truth
 from spadwarp.scene import Scene, SceneLike, Trajectory, as_scene, load_trajectory
 from spadwarp.scene.camera import camera_attributes
@@ -46,7 +47,7 @@ _PART_BYTES = 1 << 26  # of counts that are held at a time
 _IMAGES, _DETECTION = ("frame", *PIXELS), "tags/detection"
 _TAGS: dict[str, Any] = {"frame": np.int64, "y": np.int32, "x": np.int32, "pulse": np.int64, "bin": np.int32}
 _TRUTH = {name.partition("/")[2]: entry for name, entry in ARRAYS.items() if name.startswith("truth/")}
-_OF_A_FRAME = ("pulses", "seed", "gate_start", "bin_width", "edges", "period", "irf", "monte_carlo_noise")
+_OF_A_FRAME = ("pulses", "seed", "gate_start", "bin_width", "edges", "period", "irf", "target_noise_ratio")
 
 _READ_ME = (
     "Frames of a SPAD camera. Bin k covers gate_start + edges[k] to edges[k + 1] seconds of flight; without edges, "
@@ -168,7 +169,7 @@ class FramesFile(_StoredFrames):
     background: NDArray[np.float32]
     scene: Scene  # of the result that the counts were drawn from
     truth_depth: NDArray[np.float32]  # of that result, float32 `[H, W]` [m]
-    monte_carlo_noise: float | None = None
+    target_noise_ratio: float | None = None
     noise_ratio: NDArray[np.float32] | None = None  # `Result.noise_ratio` of frames of these pulses, `[H, W]`
     channel: str = "I"  # light that was counted: "I", all of it, or "co" or "cross" behind an analyser
     notes: tuple[str, ...] = ()
@@ -190,7 +191,7 @@ class FramesFile(_StoredFrames):
         for name, cube in expectations.items():
             if not (np.isfinite(cube).all() and (cube >= 0).all()):
                 file.refuse(name, "is negative or not finite in some bins")
-        noise = file.attribute("monte_carlo_noise", None)
+        noise = file.attribute("target_noise_ratio", None)
         return {
             "edges": edges,
             "irf": irf,
@@ -199,7 +200,7 @@ class FramesFile(_StoredFrames):
             "channel": file.text_attribute("channel", "I"),
             "notes": tuple(map(str, np.atleast_1d(file.attribute("notes", ())))),
             "noise_ratio": file.array("noise_ratio", np.float32, image) if "noise_ratio" in file else None,
-            "monte_carlo_noise": None if noise is None else file.real("monte_carlo_noise", "[0, inf)"),
+            "target_noise_ratio": None if noise is None else file.real("target_noise_ratio", "[0, inf]"),
             **expectations,
         }
 
@@ -388,8 +389,6 @@ class Recording:
     bound: ResultBound  # Cramér–Rao bound of one frame; `sigma` is NaN where `crlb` refuses, which the notes then say
     bound_photons: float  # photons that would make the noise in the bound a tenth
     detections: int  # counts of all frames
-    monte_carlo: MonteCarloNoise | None
-    """Noise of the simulation against the shot noise of one frame, see `monte_carlo_noise`."""
 
 
 def record_frames(
@@ -466,7 +465,6 @@ def record_frames(
         bound=bound,
         bound_photons=photons_for_noise(result.photons, bound.noise, 0.1),
         detections=detections,
-        monte_carlo=monte_carlo_noise(result, pulses=pulses),
     )
 
 
@@ -481,7 +479,7 @@ def _still(result: Result, part: Frames, frames: int, bound: Map) -> _Layout:
         **camera_attributes(scene.camera, result.focus_distance),
         "irf_sigma": irf.sigma,
         "irf_tail": irf.tail,
-        **({} if part.monte_carlo_noise is None else {"monte_carlo_noise": part.monte_carlo_noise}),
+        **({} if part.target_noise_ratio is None else {"target_noise_ratio": part.target_noise_ratio}),
         "notes": list(part.notes),
         "photons": result.photons,
         "channel": result.provenance.get("channel", "I"),
@@ -496,8 +494,7 @@ def _still(result: Result, part: Frames, frames: int, bound: Map) -> _Layout:
         "edges": (("edges",), part.edges, "s", "edges of the bins after the start of the gate"),
     }
     if result.batches > 1:
-        frame_of = scene.with_overrides(detector={"pulses_per_frame": part.pulses})
-        ratio = replace(result, scene=frame_of).noise_ratio.astype(np.float32)
+        ratio = with_frames(result, part.pulses).noise_ratio.astype(np.float32)
         arrays["noise_ratio"] = (PIXELS, ratio, "1", "variance by the simulation over that of a frame's photons")
     coordinates: dict[str, Any] = {"whole_gate": 1}
     if irf.times is not None and irf.values is not None:

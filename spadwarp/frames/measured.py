@@ -70,9 +70,8 @@ def read_histograms(
 ) -> Histograms:
     """Reads histograms; the ending of the file says which kind of file it is.
 
-    `.h5`, `.hdf5`: a result or frames of spadwarp, or an array of another program. `.npy`: an array. `.mat`, version
-    7.3 included: an array, a sparse matrix `[pixels, T]` whose pixels stand column by column, or cells `[H, W]` of time
-    tags. `.ptu`: T3 records of PicoQuant, channels added up. Floats that are all whole count as counts.
+    `.h5`, `.hdf5`: a result or frames of spadwarp, or an array of another program. `.npy`, `.mat`, `.ptu`: as in
+    docs/own_counts.md. Floats that are all whole count as counts.
 
     Args:
         path: The file.
@@ -101,7 +100,7 @@ def read_histograms(
             check_real(name, value, within)
     if gate_start is not None:
         check_real("gate_start", gate_start, "[-1, 1] s")
-    if _is_own(path):
+    if is_own(path):
         arguments = {"dataset": dataset, "axes": axes, "image size": image_size, "tag unit": tag_unit, "irf": irf}
         arguments |= {"bin width": bin_width, "sum frames": sum_frames, "gate start": gate_start}
         if clash := [name for name, value in arguments.items() if value]:
@@ -144,7 +143,7 @@ def read_histograms(
     )
 
 
-def _is_own(path: Path) -> bool:
+def is_own(path: Path) -> bool:
     """Whether it is an HDF5 file that spadwarp wrote."""
     return path.suffix.lower() in _HDF5 and (hdf5_format(path) or "").startswith("spadwarp")
 
@@ -387,7 +386,7 @@ def stored_images(path: Path, dataset: str | None, *, several: bool) -> tuple[ND
     Raises `FileError`, and `ArgumentError` where several of a `.mat` are the largest, or a `.h5` has several.
     """
     ending = path.suffix.lower()
-    if ending not in _ARRAYS or _is_own(path):
+    if ending not in _ARRAYS or is_own(path):
         return None
     with _arrays(path) as variables:
         dense = {name: one for name, one in variables.items() if one.kind == "dense"}

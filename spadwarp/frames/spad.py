@@ -30,6 +30,7 @@ from spadwarp.frames.depth import Method, arrival_time
 from spadwarp.frames.response import InstrumentResponse, SparseResponse, detector_response, response_matrix
 from spadwarp.io.hdf5 import PIXELS, image_coordinates
 from spadwarp.result.file import as_result
+from spadwarp.result.noise import UNKNOWN_NOISE, noise_problem, with_frames
 from spadwarp.result.result import Result, Truth
 from spadwarp.scene import Detector, Laser, detection_efficiency, noise_rate
 from spadwarp.values import (
@@ -45,13 +46,7 @@ from spadwarp.values import (
 if TYPE_CHECKING:
     import xarray
 
-__all__ = ["Frames", "MonteCarloNoise", "Receiver", "TimeTags", "coates", "detect", "first_photon_probabilities"]
-__all__ += ["monte_carlo_noise", "to_xarray"]
-
-LIMIT = 0.5
-"""Standard error of a pixel over its shot noise from which on it counts: variances then add up to 1.25 times."""
-
-_PART = 0.95  # of the pixels that have to be below the limit
+__all__ = ["Frames", "Receiver", "TimeTags", "coates", "detect", "first_photon_probabilities", "to_xarray"]
 
 
 class Window(NamedTuple):
@@ -330,10 +325,7 @@ class Frames:
     light and, where the source has it apart, backscatter; with the crosstalk and the afterpulses of these."""
     seed: int  # of the random numbers
     tags: TimeTags | None = None  # every detection, where it was asked for
-    monte_carlo_noise: float | None = None
-    """Standard error of the simulation over the shot noise of a frame, at the 95th percentile of the pixels; None where
-    nobody knows it. Above 0.5 `expected` is not smooth where few photons were traced, and no more are the counts that
-    are drawn from it."""
+    target_noise_ratio: float | None = None  # `Result.target_noise_ratio` of frames of these pulses; None: not known
     notes: tuple[str, ...] = ()  # what the source could not give, in words
 
     def __repr__(self) -> str:
@@ -445,64 +437,6 @@ def to_xarray(frames: Frames) -> xarray.Dataset:
     return labelled(variables, coordinates, attributes)
 
 
-@dataclass(frozen=True, kw_only=True)
-class MonteCarloNoise:
-    """The standard error of a result against the shot noise of one frame of `pulses`, both of the counts of a pixel."""
-
-    pulses: int
-    ratio: float  # standard error over shot noise, at the 95th percentile of the pixels
-    pixels: float  # part of the pixels in which it is above 0.5
-    photons: int  # that were traced
-    photons_needed: float  # that would bring `ratio` to 0.5: it falls with their root
-
-    def __str__(self) -> str:
-        return (
-            f"Monte Carlo noise, the same in every frame: the standard error of the simulation is above {LIMIT:g} of "
-            f"the shot noise of {self.pulses} pulses in {100 * self.pixels:.3g} % of the pixels, and {self.ratio:.2g} "
-            f"of it at the 95th percentile; about {self.photons_needed:.1e} photons instead of {self.photons:.1e} "
-            f"would make that {LIMIT:g}"
-        )
-
-
-UNKNOWN = (
-    "Monte Carlo noise is unknown: the result keeps no standard errors; the noise of its "
-    "histograms is drawn as if it were light, the same in every frame, and counts as information in the Cramér–Rao "
-    "bound, which is too small where few photons were traced"
-)
-
-
-def noise_caption(ratio: float | None) -> str:
-    """For the caption of a picture of frames that show the noise of the simulation; else empty."""
-    if ratio is None or ratio <= LIMIT:
-        return ""
-    return f"; too few photons traced: Monte Carlo noise of expected and counts {ratio:.2g} times the shot noise"
-
-
-def monte_carlo_noise(
-    result: Any, *, pulses: int, detector: Detector | None = None, laser: Laser | None = None
-) -> MonteCarloNoise | None:
-    """The noise that frames of so many pulses inherit from a `Result`; None where it keeps no standard errors.
-
-    `detector`, `laser`: sections of a scene; default: those of the result's.
-    """
-    if not isinstance(result, Result) or result.batches < 2:
-        return None
-    scene = result.scene
-    detector, laser = detector or scene.detector, laser or scene.laser
-    scale = laser.photons_per_pulse * detection_efficiency(laser, detector)
-    # Bins are nearly independent: a history adds to few of those of one pixel.
-    error = np.sqrt(np.square(result.expected_error).sum(axis=2)) * scale
-    noise = noise_rate(scene.model_copy(update={"detector": detector, "laser": laser}), result.truth)
-    noise = noise[..., 0] if np.ndim(noise) else noise
-    expected = result.intensity * scale + noise * (scene.gate.stop - scene.gate.start)
-    # A first-photon detector counts one a pulse at most, of light and error in the same measure.
-    counted = pulses * (-np.expm1(-expected) if detector.mode == "first_photon" else expected)
-    ratios = np.sqrt(counted) * np.divide(error, expected, out=np.zeros_like(error), where=expected > 0)
-    ratio, share = float(np.quantile(ratios, _PART)), float(np.mean(ratios > LIMIT))
-    needed = result.photons * (ratio / LIMIT) ** 2
-    return MonteCarloNoise(pulses=pulses, ratio=ratio, pixels=share, photons=result.photons, photons_needed=needed)
-
-
 _LIMITS = {"pulses": "[1, 2147483647]", "frames": "[1, 2147483647]", "first_frame": "[0, 4294967295]", "seed": SEED}
 
 
@@ -530,13 +464,11 @@ def detect(
 ) -> Frames:
     """Frames of counts that the camera would record.
 
-    First-photon counts are exact multinomials, drawn bin after bin as binomials at a cost that does not depend on
-    `pulses`. Free-running, first-photon with afterpulsing, and time tags are followed event by event, at a cost per
-    detection. Crosstalk enters as a mean: λ gains `crosstalk_probability` times the expected detections of each of the
-    four neighbours in the same bin; that its counts come in pairs is left out. Dead time acts in free-running mode.
+    First-photon counts are exact multinomials, at a cost that does not depend on `pulses`. Free-running, first-photon
+    with afterpulsing, and time tags are followed event by event, at a cost per detection. Crosstalk enters as a mean.
 
     The light of a Result has the noise of the simulation, which is drawn as if it were light, the same in every frame:
-    a warning says by how much it exceeds the shot noise (see `monte_carlo_noise`), a note that it is unknown.
+    a warning says where it shows beside that of the photons (`Result.target_noise_ratio`), a note that it is not known.
 
     Args:
         source: A `Result`, its path, or a `TorchResult`; or expected detections per pulse `[H, W, T]` (PDE included,
@@ -617,9 +549,14 @@ def detect(
         to_caller: Any = tensor_of if as_torch else wp.array.numpy
         expected, known = (to_caller(rows)[:, : seen.recorded].reshape(*image, -1) for rows in (hazard, known))
     notes = seen.missing_light(axis[0]) if detector.wrap else ()
-    noise = None if scene is None else monte_carlo_noise(result, pulses=pulses, detector=detector, laser=laser)
-    if noise is not None and noise.ratio > LIMIT:
-        warnings.warn(str(noise), SpadwarpWarning, stacklevel=3)
+    ratio = None
+    if isinstance(result, Result) and result.batches > 1:
+        exposed = with_frames(result, pulses, detector, laser)
+        ratio = exposed.target_noise_ratio
+        if problem := noise_problem(exposed):
+            warnings.warn(problem, SpadwarpWarning, stacklevel=3)
+    elif scene is not None:
+        notes += (UNKNOWN_NOISE,)
     return Frames(
         counts=counts,
         expected=expected,
@@ -631,8 +568,8 @@ def detect(
         irf=irf,
         tags=found,
         detector=detector,
-        notes=notes if scene is None or noise is not None else (*notes, UNKNOWN),
-        monte_carlo_noise=None if noise is None else noise.ratio,
+        notes=notes,
+        target_noise_ratio=ratio,
         **numbers,
     )
 

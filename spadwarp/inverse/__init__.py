@@ -1,6 +1,5 @@
 """From counts to the scene: derivatives, Fisher information, Cramér–Rao bounds of all unknowns, fits."""
 
-from spadwarp.inverse.cramer_rao import *
 from spadwarp.inverse.exposure import *
 from spadwarp.inverse.fitting import *
 from spadwarp.inverse.goodness import *

@@ -1,9 +1,8 @@
 """The likelihood's equations for unknowns and their solution, from two independent halves of photons.
 
-An expected histogram λ and its derivatives are Monte Carlo estimates. A square of one estimate is too large by its
-variance; a product of two independent estimates is right in the mean. So the weights of the score come from one half,
-what they weigh from the other, and both ways are averaged. Whatever the noise of the weights, the score's mean is 0 at
-the truth; what it costs is precision, and the covariance, which is that of the equations that were solved, has it.
+The weights of the score come from one half, what they weigh from the other, and both ways are averaged (eq I4).
+Whatever the noise of the weights, the score's mean is 0 at the truth; what it costs is precision, and the covariance,
+which is that of the equations that were solved, has it.
 
 Pixels know of each other through the unknowns that they share alone: the matrix has the shape of an arrow. The pixels'
 own unknowns are eliminated (Schur's complement), so that the cost grows with the pixels and not with their cube.

@@ -12,7 +12,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from spadwarp.frames import Frames, FramesFile, Histograms, InstrumentResponse, is_frames_file, read_histograms
-from spadwarp.frames.spad import LIMIT, Window
+from spadwarp.frames.spad import Window
+from spadwarp.result import NOISE_GOAL
 from spadwarp.scene import Detector, Scene, phase_function
 from spadwarp.transport import truth_maps
 from spadwarp.values import ArgumentError, check_integer
@@ -37,9 +38,8 @@ class Exposure:
     window: tuple[float, int]  # start [s] and bins of the detector's window
     tdc_widths: NDArray[np.float64] | None = None  # relative widths of its bins; None: equal
     irf: InstrumentResponse | None = None  # the response that the counts contain; None: that of the scene
-    monte_carlo_noise: float | None = None
-    """Of simulated counts: standard error of their simulation over their shot noise, at the 95th percentile of the
-    pixels; None: not known, or measured."""
+    noise_ratio: float | None = None
+    """Of simulated counts `Result.target_noise_ratio` for all pulses; None: not known, or measured."""
 
     def left(self) -> NDArray[np.float32]:
         """Pulses without a count before each bin, `[pixel, bin]`: those that first-photon counting has left there."""
@@ -50,14 +50,13 @@ class Exposure:
 
     def warnings(self) -> list[str]:
         """Sentences on simulated counts that hold more noise than their photons have."""
-        noise = self.monte_carlo_noise
-        if noise is None or noise <= LIMIT:
+        if self.noise_ratio is None or self.noise_ratio <= NOISE_GOAL:
             return []
         return [
             f"the counts are simulated, and the simulation traced too few photons for {self.pulses} pulses: its noise, "
-            f"the same in every frame, is {noise:.2g} times the shot noise of the counts (95th percentile of the "
-            f"pixels); the standard errors do not contain it. {math.ceil((noise / LIMIT) ** 2)} times the photons "
-            f"would make it {LIMIT:g}"
+            f"the same in every frame, is {self.noise_ratio:.2g} times the variance of the counts in the median pixel; "
+            f"the standard errors do not contain it. {self.noise_ratio / NOISE_GOAL:.2g} times the photons would make "
+            f"it {NOISE_GOAL:g} times"
         ]
 
 
@@ -83,13 +82,13 @@ def read_exposure(counts: Any, scene: Scene, *, pulses: int | None = None, **fac
         counts = FramesFile.load(path) if is_frames else read_histograms(path, **facts)
     values, start, width, irf, widths, noise = counts, gate.start, gate.bin_width, None, None, None
     if isinstance(counts, Frames | FramesFile):
-        start, width, irf, noise = counts.gate_start, counts.bin_width, counts.irf, counts.monte_carlo_noise
+        start, width, irf, noise = counts.gate_start, counts.bin_width, counts.irf, counts.target_noise_ratio
         steps = np.diff(counts.edges)
         widths = None if np.allclose(steps, steps[0], rtol=1e-9) else steps
         pulses = counts.pulses if pulses is None else pulses
         if isinstance(counts, Frames) and counts.summed:
             pulses *= counts.frames
-            noise = None if noise is None else noise * math.sqrt(counts.frames)
+            noise = None if noise is None else noise * counts.frames
         values = counts.counts() if isinstance(counts, FramesFile) else counts.counts
     elif isinstance(counts, Histograms):
         start, irf, values = counts.gate_start, counts.irf, counts.values
@@ -112,7 +111,7 @@ def read_exposure(counts: Any, scene: Scene, *, pulses: int | None = None, **fac
         window=(start, cube.shape[1]),
         tdc_widths=widths,
         irf=irf,
-        monte_carlo_noise=None if noise is None else noise * math.sqrt(frames),
+        noise_ratio=None if noise is None else noise * frames,
     )
 
 

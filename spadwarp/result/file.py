@@ -15,11 +15,12 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from spadwarp.io.arrays import read_exr, write_exr
-from spadwarp.io.hdf5 import PIXELS, Coordinate, Hdf5File, name_dimensions, read_hdf5, write_hdf5, write_packed
+from spadwarp.io.hdf5 import Coordinate, Hdf5File, name_dimensions, read_hdf5, write_hdf5, write_packed
 from spadwarp.io.paths import file_within
 from spadwarp.result.flux import flux_arrays, part_of
 from spadwarp.result.result import (
     ARRAYS,
+    TABLES,
     Reconstruction,
     Result,
     ResultHead,
@@ -47,26 +48,9 @@ _CHUNK_BYTES = 1 << 20  # HDF5's default chunk cache
 _UNITS = "[1e-30, 1e30]"  # photons
 # As JSON: its integers have no limit.
 _RECORDS = ("energy_balance", "counters", "batch_moments", "timing", "provenance")
-_READ_ME = (
-    "Expected fraction of emitted photons per pixel and time bin = tallies * unit / photons, summed over component; "
-    "times laser_photons_per_pulse * detector_pde (with the filter before it) it is the expected detections per pulse. "
-    "In a scan photons_per_position stands for photons. What else an array holds is in its long_name. "
-    "Bin k covers [gate_start + k * bin_width, gate_start + (k + 1) * bin_width) seconds of flight; "
-    "time * 299792458 / group_index is the path in metres, laser to target to lens. "
-    "Of second moments, where errors are kept, each batch counts by its photons in units of batch_size. "
-    "truth is NaN where nothing is hit; in a scan along a trajectory it is in the frame of the pixel's shot. "
-    "Camera frame: +x right, +y down, +z forward; camera_matrix and camera_distortion are OpenCV's, the columns of "
-    "camera_rotation are the camera's axes in the world, camera_position its lens; laser_position and laser_axis are "
-    "in the camera frame."
-)
-
-_DIMENSIONS = {name: entry[1:] for name, entry in ARRAYS.items()} | {
-    "photons_per_position": (PIXELS, "1", "photons emitted at the position of the pixel"),
-    "shot/time": (PIXELS, "s", "of the pixel's shot, from the first shot on"),
-    "shot/position": ((*PIXELS, "axis"), "m", "of the lens in the world"),
-    "shot/line_of_sight": ((*PIXELS, "axis"), "1", "unit vector in the world along which truth/range counts"),
-    "photon_ranges": (("run", "limit"), "1", "ids of the photons"),
-    "requested": (("limit",), "1", "ids of the requested photons"),
+_DIMENSIONS = {
+    name: (tuple(entry["dimensions"]), entry["unit"], entry["meaning"])
+    for name, entry in (TABLES["arrays"] | TABLES["described"]).items()
 }
 
 
@@ -101,7 +85,7 @@ def save_result(result: Result, path: str | Path, *, compression: int = 1) -> Pa
         "limit": (["start", "stop"], "1", "of photon ids"),
     }
     with write_hdf5(path) as file:
-        head = {"format": FORMAT, "format_version": FORMAT_VERSION, "read_me": _READ_ME}
+        head = {"format": FORMAT, "format_version": FORMAT_VERSION, "read_me": TABLES["read_me"]}
         names = {group: list(found.names) for group, found in signed_of(result).items()}
         file.attrs.update({**head, **_attributes(result), **names})
         for name, array in arrays.items():
@@ -231,12 +215,6 @@ def as_result(result: ResultLike, name: str = "result") -> Result:
     return result
 
 
-def read_head(path: str | Path) -> ResultHead:
-    """Of the result in a file. Raises `FileError`."""
-    with read_hdf5(path, FORMAT, version=FORMAT_VERSION) as file:
-        return _head(file)
-
-
 def _head(file: Hdf5File) -> ResultHead:
     ranges = tuple((int(start), int(stop)) for start, stop in file.array("photon_ranges", np.uint64, (None, 2)))
     if not ranges or any(start >= stop for start, stop in ranges) or len(joined(ranges)) > len(ranges):
@@ -364,7 +342,7 @@ def save_truth_maps(result: Result, path: str | Path) -> Path:
     channels = {"Z": truth.depth, "range": truth.range}
     channels |= {f"N.{axis}": truth.normal[..., index] for index, axis in enumerate("XYZ")}
     channels |= dict.fromkeys("RGB", truth.reflectance)
-    return write_exr(path, channels, {"content": "truth", "R G B": "reflectance", **_exr_notes(result)})
+    return write_exr(path, channels, {"R G B": "reflectance", **exr_notes("truth", result.scene, result)})
 
 
 def load_truth_maps(path: str | Path) -> Truth:
@@ -379,19 +357,15 @@ def load_truth_maps(path: str | Path) -> Truth:
 
 def save_depth_exr(result: Result, depth: ArrayLike, path: str | Path) -> Path:
     """A depth frame of the result as EXR: Z (planar depth [m], NaN where nothing returned). Raises `FileError`."""
-    return write_exr(path, {"Z": depth}, {"content": "measured depth", **_exr_notes(result)})
+    return write_exr(path, {"Z": depth}, exr_notes("measured depth", result.scene, result))
 
 
-def _exr_notes(result: Result) -> dict[str, str | int | float]:
-    scene = result.scene
-    return {
-        "Z": "planar depth [m]",
-        "frame": "+x right, +y down, +z forward",
-        "pixel_tangent": scene.camera.pixel_tangent,
-        "photons": result.photons,
-        "seed": result.seed,
-        "config": scene.to_toml(),
-    }
+def exr_notes(content: str, scene: Scene | None, result: Result | None = None) -> dict[str, Any]:
+    """Metadata of an EXR image of depth."""
+    notes: dict[str, Any] = {"content": content, "Z": "planar depth [m]", "frame": "+x right, +y down, +z forward"}
+    if scene is not None:
+        notes |= {"pixel_tangent": scene.camera.pixel_tangent, "config": scene.to_toml()}
+    return notes if result is None else {**notes, "photons": result.photons, "seed": result.seed}
 
 
 # Truth maps from the EXR files that a game engine or Blender writes

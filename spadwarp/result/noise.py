@@ -4,14 +4,15 @@ leave in the expected light."""
 from __future__ import annotations
 
 import math
-from typing import TYPE_CHECKING, NamedTuple
+from dataclasses import replace
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from spadwarp.arrays import Floats
 from spadwarp.io.text import duration
-from spadwarp.scene import Scene, noise_rate
+from spadwarp.scene import Detector, Laser, Scene, noise_rate
 from spadwarp.values import check_real
 
 if TYPE_CHECKING:
@@ -22,6 +23,8 @@ __all__ = ["NOISE_GOAL", "PhotonsNeeded", "noise_problem", "photons_needed", "un
 NOISE_GOAL = 0.1
 """`Result.target_noise_ratio` up to which a result's noise does not show beside that of a frame's photons: it adds 5 %
 to their standard deviation."""
+
+UNKNOWN_NOISE = "the noise of the simulation is not known: the result keeps no standard errors"
 
 _FWHM_PER_SIGMA = math.sqrt(8.0 * math.log(2.0))
 _NARROW = 0.2  # standard deviation [bins] of a response that leaves light in its bin
@@ -90,6 +93,14 @@ def _blurred(scene: Scene, values: Floats) -> Floats:
     return sum(weight * padded[:, k : k + bins] for k, weight in enumerate(weights / weights.sum()))
 
 
+def with_frames(result: Result, pulses: int, detector: Detector | None = None, laser: Laser | None = None) -> Result:
+    """The result for frames of so many pulses, also of another detector or laser: their noise is that of its ratios."""
+    scene, of_frame = result.scene, {"pulses_per_frame": pulses}
+    changed: dict[str, Any] = {"detector": (detector or scene.detector).model_copy(update=of_frame)}
+    changed["analytic"] = scene.analytic.model_copy(update={"pulses_per_depth_frame": None})
+    return replace(result, scene=scene.model_copy(update={**changed, "laser": laser or scene.laser}))
+
+
 def unclear_pixels(result: Result) -> NDArray[np.bool_]:
     """Pixels with light whose brightest bin is not known to a third: pictures of them show noise of the simulation.
     bool `[H, W]`; none where the result has no errors."""
@@ -134,7 +145,7 @@ def photons_needed(result: Result, noise_ratio: float = NOISE_GOAL) -> PhotonsNe
 def noise_problem(result: Result) -> str:
     """A sentence for the user where the noise of the simulation shows beside that of the photons; else empty."""
     if result.batches < 2:
-        return "the noise of the simulation is not known: too few photons were traced to tell"
+        return UNKNOWN_NOISE
     ratio = result.target_noise_ratio
     if ratio <= NOISE_GOAL:
         return ""
@@ -147,3 +158,10 @@ def noise_problem(result: Result) -> str:
         f"photons in the median pixel; about {photons:.1e} photons instead of {result.photons:.1e} would make it "
         f"{NOISE_GOAL:g} times{time}"
     )
+
+
+def noise_caption(ratio: float | None) -> str:
+    """For the caption of a picture of frames that show the noise of the simulation; else empty."""
+    if ratio is None or ratio <= NOISE_GOAL:
+        return ""
+    return f"; too few photons traced: noise of the simulation is {ratio:.2g} times the variance of the photons"

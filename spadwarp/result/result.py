@@ -4,9 +4,11 @@ from __future__ import annotations
 
 import math
 import re
+import tomllib
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
+from importlib.resources import files
 from pathlib import Path
 from typing import Any, Literal, NamedTuple, get_args
 
@@ -14,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from spadwarp.arrays import Floats
-from spadwarp.io.hdf5 import PIXELS, Coordinate, image_coordinates
+from spadwarp.io.hdf5 import Coordinate, image_coordinates
 from spadwarp.result.flux import FluxValues, check_flux, flux_arrays, flux_of
 from spadwarp.result.noise import noise_ratios, photons_needed, target_noise_ratio
 from spadwarp.result.tallies import NO_BATCHES, SignedTallies, Tallies, count, photons_per_position
@@ -47,40 +49,14 @@ _SMALL_ERROR = 0.005
 _CAMERAS = "simulate with camera.polarisation = 'analyser' or 'stokes'"
 
 
-_VOXELS = (*PIXELS, "time")
-_SIGNED = {
-    "derivatives": ("parameter", "derivative of the fraction of the emitted photons"),
-    "channels": ("channel", "fraction of the emitted photons in each channel"),
-}
+_DIMENSION_OF = {"derivatives": "parameter", "channels": "channel"}
 
+TABLES = tomllib.loads((files("spadwarp.result") / "arrays.toml").read_text(encoding="utf-8"))
 ARRAYS: dict[str, tuple[Any, tuple[str, ...], str, str]] = {
-    "tallies": (np.int64, ("component", *_VOXELS), "1", "times unit over photons: fraction of the emitted photons"),
-    "half": (np.int64, ("component", *_VOXELS), "1", "tallies of the batches with an even number"),
-    "second_moment": (np.uint64, ("word", *_VOXELS), "1", "sum over batches of the squared tally"),
-    "reconstruction/histogram": (np.float32, ("component", *_VOXELS), "1", "fraction of the emitted photons"),
-    "reconstruction/error": (np.float32, _VOXELS, "1", "of the sum over components"),
-    "truth/depth": (np.float32, PIXELS, "m", "true planar depth"),
-    "truth/range": (np.float32, PIXELS, "m", "true distance along the line of sight"),
-    "truth/normal": (np.float32, (*PIXELS, "axis"), "1", "unit normals towards the camera"),
-    "truth/reflectance": (np.float32, PIXELS, "1", "Lambertian reflectance"),
+    name: (np.dtype(entry["type"]).type, tuple(entry["dimensions"]), entry["unit"], entry["meaning"])
+    for name, entry in TABLES["arrays"].items()
 }
 """Those of a result by their names in its file: type, dimensions, unit, meaning."""
-for _group, (_dimension, _meaning) in _SIGNED.items():
-    ARRAYS |= {
-        f"{_group}/tallies": (
-            np.int64,
-            (_dimension, "component", *_VOXELS),
-            "1",
-            f"times {_group}/unit over photons: {_meaning}",
-        ),
-        f"{_group}/second_moment": (
-            np.uint64,
-            ("word", _dimension, *_VOXELS),
-            "1",
-            f"sum over batches of the squared tally of the {_dimension}",
-        ),
-        f"{_group}/unit": (np.float64, (_dimension,), "1", f"of the tallies of each {_dimension}"),
-    }
 
 
 def shape_of(name: str, height: int, width: int, **counts: int) -> tuple[int, ...]:
@@ -181,7 +157,7 @@ class Result(Shown, ResultHead, Tallies):
         if channels != expected:
             text = f"channels are {', '.join(channels) or 'none'}; those of the scene's camera are"
             raise ArgumentError(f"{text} {', '.join(expected) or 'none'}")
-        counts = {_SIGNED[group][0]: len(found.names) for group, found in signed.items()}
+        counts = {_DIMENSION_OF[group]: len(found.names) for group, found in signed.items()}
         counts["component"] = len(self.scene.components)
         camera, counts["time"] = self.scene.camera, self.scene.gate.bins
         for name, array in arrays_of(self).items():

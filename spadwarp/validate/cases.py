@@ -642,7 +642,22 @@ class CaseResult:
     standard_error: float  # of the difference; 0 where both must be equal
     z: float  # the difference in standard deviations of a normal distribution
     p: float  # two-sided probability of such a z, corrected for the number of quantities in the run (Holm 1979)
-    passed: bool  # whether p exceeds `FAMILY_LEVEL`
+    passed: bool  # whether p exceeds `FAMILY_LEVEL`, or that of the run
+
+    def __str__(self) -> str:
+        verdict = "ok" if self.passed else "FAILED"
+        if not self.standard_error:
+            return f"{self.value:g} ({verdict})"
+        return f"{self.value:.5f} ± {self.standard_error:.5f}, known: {self.reference:.5f} ({verdict})"
+
+
+def judged(measured: Sequence[tuple[str, Quantity]], level: float = FAMILY_LEVEL) -> list[CaseResult]:
+    """Results of quantities with the names of their cases; a correct simulator fails with the probability `level`."""
+    family = holm(two_sided_p(one.z) for _, one in measured)
+    return [
+        CaseResult(name, one.name, one.estimate.value, one.reference, one.standard_error, one.z, p, p > level)
+        for (name, one), p in zip(measured, family, strict=True)
+    ]
 
 
 def run(
@@ -679,11 +694,7 @@ def run(
             if progress is not None:
                 progress(CASES[name])
             measured += [(name, quantity) for quantity in CASES[name].measure(setup)]
-    family = holm(two_sided_p(one.z) for _, one in measured)
-    return [
-        CaseResult(name, one.name, one.estimate.value, one.reference, one.standard_error, one.z, p, p > FAMILY_LEVEL)
-        for (name, one), p in zip(measured, family, strict=True)
-    ]
+    return judged(measured)
 
 
 def report(results: Sequence[CaseResult], *, photons: int, seed: int) -> dict[str, Any]:

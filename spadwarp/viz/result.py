@@ -21,7 +21,6 @@ from numpy.typing import ArrayLike, NDArray
 from spadwarp.analytic import AnalyticResult, Proposal
 from spadwarp.files import summary
 from spadwarp.frames import Frames, FramesFile, Method, first_photon_probabilities
-from spadwarp.frames.spad import noise_caption
 from spadwarp.inverse import Fit
 from spadwarp.io.text import fact, progress_report
 from spadwarp.result import (
@@ -34,6 +33,7 @@ from spadwarp.result import (
     degree_of_polarisation,
     unclear_pixels,
 )
+from spadwarp.result.noise import noise_caption
 from spadwarp.result.result import pixel_channel, pixel_standard_error
 from spadwarp.scene import Medium, Scene
 from spadwarp.scene.sight import lines_of_sight
@@ -549,7 +549,7 @@ def _frame_figure(
         panels.figure.key(axes, 1.7)
     which = "all frames added up" if shown.summed else f"frame {shown.first_frame + index + 1}"
     mode = "" if file is None else f", {file.scene.detector.mode.replace('_', '-')}{channel_text(file.channel)}"
-    noise = hatched or noise_caption(shown.monte_carlo_noise)
+    noise = hatched or noise_caption(shown.target_noise_ratio)
     panels.figure.caption(f"{which}: {count(shown.pulses)} pulses{mode}; seed {shown.seed}{noise}")
     return panels.figure
 

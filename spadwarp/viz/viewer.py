@@ -21,9 +21,9 @@ from spadwarp.files import Held, load, sequence
 from spadwarp.files.formats import FrameSequence
 from spadwarp.frames import FramesFile, InstrumentResponse, detector_response
 from spadwarp.frames.file import SequenceFile
-from spadwarp.frames.spad import noise_caption
 from spadwarp.io.paths import atomic_path, check_apart
 from spadwarp.result import Channel, Result, analyser_channel
+from spadwarp.result.noise import noise_caption
 from spadwarp.scene import Scene
 from spadwarp.scene.sight import lines_of_sight
 from spadwarp.values import ArgumentError, FileError, check_choice, check_integer, check_real, count
@@ -154,7 +154,7 @@ def _of_frames(file: FramesFile, method: str | None, frame: int) -> _Page:
     mode = file.scene.detector.mode.replace("_", "-")
     return _Page(
         caption=f"frame {frame} of {file.frames}: {count(file.pulses)} pulses, {mode}, seed {file.seed}; "
-        f"expectations before pile-up{noise_caption(file.monte_carlo_noise)}",
+        f"expectations before pile-up{noise_caption(file.target_noise_ratio)}",
         scene=file.scene,
         depth=file.depth(chosen, frame),
         method=chosen,

@@ -79,7 +79,7 @@ def test_counts_and_floor_are_those_of_the_whole_simulation(found):
     result = spadwarp.simulate(whole, device="cpu")
     detections = np.median(result.detections.sum(-1))
     assert found.pilot.target + found.pilot.backscatter == pytest.approx(detections, rel=0.1)
-    with pytest.warns(spadwarp.SpadwarpWarning, match="Monte Carlo noise"):
+    with pytest.warns(spadwarp.SpadwarpWarning, match="not enough photons"):
         frames = spadwarp.detect(result, pulses=2_000_000_000, seed=1, device="cpu")
     time = frames.arrival_time("likelihood", device="cpu")[0]
     depth = spadwarp.scene.sight.depth_from_time(time, scene=whole)

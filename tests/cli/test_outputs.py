@@ -160,7 +160,7 @@ def test_a_dataset_is_no_output(tmp_path):
     assert not (tmp_path / "nosuch").exists()
 
 
-@pytest.mark.filterwarnings("ignore:Monte Carlo noise")
+@pytest.mark.filterwarnings("ignore:not enough photons")
 @pytest.mark.skipif(os.name != "posix", reason="limits of POSIX")
 @pytest.mark.parametrize(
     "words",

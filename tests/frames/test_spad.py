@@ -10,7 +10,6 @@ import pytest
 import warp as wp
 
 import spadwarp
-from helpers.scenes import scene
 from helpers.synthetic_result import make_result, make_scene
 from spadwarp.frames import (
     FramesFile,
@@ -18,7 +17,6 @@ from spadwarp.frames import (
     coates,
     detect,
     first_photon_probabilities,
-    monte_carlo_noise,
     record_frames,
 )
 from spadwarp.frames.spad import Receiver
@@ -216,34 +214,15 @@ def test_wrong_counts_are_named(counts, pulses, match):
 WEAK = Laser(pulse_energy=1e-15)  # far from pile-up
 
 
-@pytest.mark.slow
-def test_frames_of_two_runs_differ_by_what_is_said(whole):
-    """Pixel by pixel, the mean over frames is off by the standard error, in units of the shot noise of a frame; that
-    noise grows with the square root of the pulses, the standard error with their number."""
-    result = whole
-    pulses = 100_000
-    fewer, noise = (monte_carlo_noise(result, pulses=number, laser=WEAK) for number in (1000, pulses))
-    part = 10  # runs of a tenth of the photons, whose spread is larger by its root
-    others = [spadwarp.simulate(scene(), photons=result.photons // part, seed=k, device="cpu") for k in range(100, 124)]
-    scale = pulses * WEAK.photons_per_pulse * result.scene.detector.pde
-    spread = np.std([other.intensity for other in others], axis=0, ddof=1) * scale / np.sqrt(part)
-    dark = pulses * result.scene.detector.noise_rate * (result.scene.gate.stop - result.scene.gate.start)
-    ratio = spread / np.sqrt(result.intensity * scale + dark)
-    # Each spread has a relative standard error of 1/sqrt(2 * 23), and so has the standard error from the batches.
-    assert noise.ratio == pytest.approx(np.quantile(ratio, 0.95), rel=0.3)
-    assert noise.photons_needed == pytest.approx(noise.photons * (noise.ratio / 0.5) ** 2)
-    assert noise.ratio == pytest.approx(10 * fewer.ratio)
-
-
 def test_a_warning_with_numbers_or_a_note_that_nobody_knows(whole):
     keywords = {"laser": WEAK, "seed": 1, "device": "cpu"}
-    with pytest.warns(SpadwarpWarning, match=r"Monte Carlo noise.* of the pixels, and .* photons instead of") as caught:
+    with pytest.warns(SpadwarpWarning, match="not enough photons: .* photons instead of") as caught:
         frames = spadwarp.detect(whole, pulses=10**8, **keywords)
     assert len(caught) == 1 and frames.notes == ()
     alone = dataclasses.replace(whole, second_moment=None, batch_size=0, batches=0)
     with warnings.catch_warnings(action="error"):
         quiet, unknown = (spadwarp.detect(run, pulses=1000, **keywords) for run in (whole, alone))
-    assert quiet.notes == () and "Monte Carlo noise is unknown" in unknown.notes[0]
+    assert quiet.notes == () and "simulation is not known" in unknown.notes[0]
 
 
 def test_slopes_of_a_receiver_with_crosstalk_are_differences_of_its_rates():

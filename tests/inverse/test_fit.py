@@ -182,6 +182,6 @@ def test_noise_that_simulated_counts_inherit_is_said():
     scene = plate()
     few = spadwarp.simulate(scene, photons=30_000, seed=2, device="cpu")
     frames = spadwarp.detect(few, pulses=500_000, frames=4, seed=3, device="cpu")
-    assert read_exposure(frames, scene).monte_carlo_noise == pytest.approx(2 * frames.monte_carlo_noise)
+    assert read_exposure(frames, scene).noise_ratio == pytest.approx(4 * frames.target_noise_ratio)
     found = fit(frames, scene, UNKNOWN, photons=30_000)
     assert any("the simulation traced too few photons for 2000000 pulses" in text for text in found.warnings)

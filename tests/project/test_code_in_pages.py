@@ -107,7 +107,7 @@ def run_small(line):
         run(*arguments)
 
 
-@pytest.mark.filterwarnings("ignore:Monte Carlo noise")
+@pytest.mark.filterwarnings("ignore:not enough photons")
 @pytest.mark.parametrize("page", WITH_PYTHON, ids=by_name)
 def test_python_in_the_text_runs(page, checkout, tmp_path):
     runpy.run_path(program_of(page, tmp_path))
@@ -182,7 +182,7 @@ def test_notebook_runs(path, tmp_path):
     outputs = [output for cell in execute(path, tmp_path).cells for output in cell.get("outputs", [])]
     assert any("image/png" in output.get("data", {}) for output in outputs)
     said = "".join(output["text"] for output in outputs if output.get("name") == "stderr")
-    assert "Warning" not in said.replace("SpadwarpWarning: Monte Carlo noise", ""), said
+    assert "Warning" not in said.replace("SpadwarpWarning: not enough photons", ""), said
 
 
 @pytest.mark.parametrize("path", NOTEBOOKS, ids=by_name)

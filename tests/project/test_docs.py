@@ -179,7 +179,7 @@ def test_figure_of_a_capture_finds_its_own_model(tmp_path, monkeypatch):
     assert (tmp_path / "measured.png").read_bytes().startswith(b"\x89PNG")
 
 
-@pytest.mark.filterwarnings("ignore:Monte Carlo noise")  # 2000 photons
+@pytest.mark.filterwarnings("ignore:not enough photons")  # 2000 photons
 def test_formats_page_names_everything_in_the_files(tmp_path):
     """Every dataset and attribute of a result with errors, of frames with tags, of analytic frames and of records."""
     scene = make_scene(transport={"photons": 2000, "seed": 1})

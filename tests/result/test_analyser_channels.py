@@ -15,7 +15,7 @@ from spadwarp.dataset import FrameReader, export_dataset
 from spadwarp.result import COMPONENTS, analyser_channel, degree_of_polarisation
 from spadwarp.values import ArgumentError, ConfigError
 
-pytestmark = pytest.mark.filterwarnings("ignore:Monte Carlo noise")  # few photons
+pytestmark = pytest.mark.filterwarnings("ignore:not enough photons")  # few photons
 
 PLANE = {"builtin": "plane", "size": [4.0, 4.0], "translation": [0.0, 0.0, 2.0], "reflectance": 0.5}
 

@@ -16,7 +16,7 @@ CPU = {"device": "cpu"}
 
 
 @pytest.mark.slow
-@pytest.mark.filterwarnings("ignore:Monte Carlo noise")
+@pytest.mark.filterwarnings("ignore:not enough photons")
 @pytest.mark.parametrize("mode", ["first_photon", "free_running"])
 def test_ratio_is_that_of_seeds_and_frames(mode):
     """The variance of a matched filter's output over 40 seeds, over its variance in frames of counts of one seed."""
