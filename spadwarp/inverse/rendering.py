@@ -247,7 +247,8 @@ class _PlacedReceiver(NamedTuple):
 
     def rates(self, light: ExpectedLight) -> Rows:
         """λ of light."""
-        return self._with_change(self.receiver.hazard(light.total).numpy(), light)
+        rates: Rows = np.maximum(self._with_change(self.receiver.hazard(light.total).numpy(), light), 0.0)
+        return rates  # the cubic of a shift swings below 0
 
     def slopes(self, slopes: Mapping[str, ExpectedLight], unknowns: Sequence[Unknown]) -> Rows:
         """Derivatives of λ, `[unknown, pixel, bin]`."""

@@ -807,6 +807,8 @@ def _instead(key: Key, info: FieldInfo | None, kind: str, value: Any) -> str:
     """A hint where a value is of another kind: how it is written."""
     if kind == "tuple_type" and isinstance(value, Mapping):
         return f" of tables; write [[{key_text(key)}]]"
+    if kind.startswith("model") and isinstance(value, list) and all(isinstance(one, Mapping) for one in value):
+        return f", of which there is one; write [{key_text(key)}]"
     if kind == "tuple_type" and isinstance(value, str) and not {float, int} & set(parts_of(info)):
         return f"; write [{value!r}]"
     models = models_of(info) if kind.startswith("model") else []

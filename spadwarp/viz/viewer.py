@@ -28,7 +28,7 @@ from spadwarp.scene import Scene
 from spadwarp.scene.sight import lines_of_sight
 from spadwarp.values import ArgumentError, FileError, check_choice, check_integer, check_real, count
 from spadwarp.viz import style
-from spadwarp.viz.result import channel_text, middle_plane
+from spadwarp.viz.result import channel_text, how_made, middle_plane
 from spadwarp.viz.style import PaperFigure, colour_map, median_pixel, paper
 
 __all__ = ["video", "view"]
@@ -122,9 +122,8 @@ def _of_result(result: Result, method: str | None, device: Any) -> _Page:
     # In a scan the positions' numbers of photons differ by one at most.
     scale = float(result.tally_value.mean()) * per_pulse
     chosen: Any = method or "centroid"
-    partial = ", interrupted" if result.partial else ""
     return _Page(
-        caption=f"{count(result.photons)} photons, seed {result.seed}, {scene.transport.estimator}{partial}"
+        caption=f"{count(result.photons)} photons{how_made(result)}, seed {result.seed}, {scene.transport.estimator}"
         f"{channel_text(result.provenance.get('channel'))}; expected histograms, before the instrument response",
         scene=scene,
         depth=result.depth(method=chosen, device=device),
