@@ -440,9 +440,8 @@ class Fitter:
         )
 
     def _forget_unseen(self, expected: Rows, target: Rows, solution: Solution) -> dict[str, str]:
-        """Makes NaN of the solution's variances where no light depends on an unknown, of the counts or of the photons
-        traced; returns the names of such of the whole exposure, with the reason. `expected`, `target`: mean counts, and
-        those by light of the targets."""
+        """Makes NaN of the solution's variances where no light, counted or traced, depends on an unknown; returns those
+        of the whole exposure, and why. `expected`, `target`: mean counts, and those by light of the targets."""
         counts, unseen = self.exposure.counts, dict[str, str]()
         assert counts is not None
         on_targets = [unknown.name == DEPTH or unknown.name.startswith("targets") for unknown in self.unknowns]
@@ -830,9 +829,6 @@ def _coarse_step(
 
 def _middle_depth(depth: NDArray[np.floating]) -> float:
     """Depth in the pixel nearest to the middle of the image that sees a target [m]; 0 without any."""
-    rows, columns = np.nonzero(np.isfinite(depth))
-    if not rows.size:
-        return 0.0
-    height, width = depth.shape
-    nearest = np.argmin((rows - 0.5 * (height - 1)) ** 2 + (columns - 0.5 * (width - 1)) ** 2)
-    return float(depth[rows[nearest], columns[nearest]])
+    there = np.argwhere(np.isfinite(depth))
+    away = ((there - 0.5 * (np.array(depth.shape) - 1)) ** 2).sum(axis=1)
+    return float(depth[tuple(there[away.argmin()])]) if len(there) else 0.0

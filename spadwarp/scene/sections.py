@@ -807,16 +807,14 @@ def _instead(key: Key, info: FieldInfo | None, kind: str, value: Any) -> str:
     """A hint where a value is of another kind: how it is written."""
     if kind == "tuple_type" and isinstance(value, Mapping):
         return f" of tables; write [[{key_text(key)}]]"
-    if kind.startswith("model") and isinstance(value, list) and all(isinstance(one, Mapping) for one in value):
-        return f", of which there is one; write [{key_text(key)}]"
     if kind == "tuple_type" and isinstance(value, str) and not {float, int} & set(parts_of(info)):
         return f"; write [{value!r}]"
     models = models_of(info) if kind.startswith("model") else []
     if not models:
         return _factor(key, value)
     if not isinstance(value, str):
-        fields = list(models[0].model_fields)
-        return f" of {', '.join(fields[:8])}{', ...' if len(fields) > 8 else ''}"
+        fields, once = list(models[0].model_fields), f", of which there is one; write [{key_text(key)}]"
+        return once if isinstance(value, list) else f" of {', '.join(fields[:8])}{', ...' * (len(fields) > 8)}"
     known = list(PRESETS.get(getattr(models[0], "section", ""), {}))
     if value in known:
         return f'; a preset is taken by {{preset = "{value}"}}'

@@ -242,10 +242,8 @@ def _result_figure(
         axis, bar = panels.place("Normal")
         axis.imshow(np.where(np.isfinite(normal), normal, float(style.MISSING)).clip(0.0, 1.0))
         bar.axis("off")
-        if np.isfinite(normal).any():
-            style.middle_text(bar, "red: right, green: up,\nblue: to the camera")
-        else:
-            style.middle_text(axis, "no values")
+        style.middle_text(bar, "red: right, green: up,\nblue: to the camera")
+        style.middle_text(axis, "" if np.isfinite(normal).any() else "no values")
         panels.show(truth.reflectance, "Reflectance", "Lambertian reflectance", INTENSITY_MAP, (0.0, 1.0))
     else:
         measured = np.asarray(depth, dtype=np.float64)
@@ -364,8 +362,7 @@ def _caption(result: Result) -> str:
 
 def how_made(result: Result) -> str:
     """What a caption adds to the photons."""
-    better = "" if result.reconstruction is None else ", reconstructed"
-    return f"{', interrupted' * result.partial}{better}"
+    return ", interrupted" * result.partial + ", reconstructed" * (result.reconstruction is not None)
 
 
 def channel_text(channel: str | None) -> str:
@@ -668,8 +665,7 @@ def draw_denoised(
         target, found = np.isfinite(truth), np.isfinite(denoised)
         missed, invented = target & ~found, found & ~target
         parts = (some.sum() / max(1, of.sum()) for some, of in ((missed, target), (invented, ~target)))
-        of_target, of_water = map(percent, parts)
-        label += f"\nblack: missed, {of_target} %\nred: invented, {of_water} %"
+        label += "\nblack: missed, {} %\nred: invented, {} %".format(*map(percent, parts))
         style.mark_pixels(panels.show_depth(denoised, "Denoised", limits, label), missed, invented)
         panels.show_depth(truth, "Truth", limits)
         panels.show_error(denoised - truth, "Denoised − truth")
@@ -740,13 +736,9 @@ def progress_bar(unit: str = "photons") -> Callable[[str, int, int], None]:
     Args:
         unit: What is counted, such as "photons", "frames" or "steps".
     """
-    return progress_report(_display() if _in_notebook() else _print, unit)
-
-
-def _in_notebook() -> bool:
-    """Whether a kernel of Jupyter runs this."""
     ipython = sys.modules.get("IPython")
-    return hasattr(ipython.get_ipython(), "kernel") if ipython is not None else False
+    in_notebook = ipython is not None and hasattr(ipython.get_ipython(), "kernel")
+    return progress_report(_display() if in_notebook else _print, unit)
 
 
 def _print(part: float | None, text: str) -> None:

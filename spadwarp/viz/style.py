@@ -319,10 +319,9 @@ def hatch(axis: Axes, pixels: NDArray[np.bool_]) -> None:
         padded = np.pad(pixels, 1).repeat(2, axis=0).repeat(2, axis=1)[1:-1, 1:-1].astype(np.float64)
         height, width = pixels.shape  # corners of the pixels, so that one alone is a square
         x, y = (np.repeat(np.arange(n + 1) - 0.5, 2) + np.tile([-1e-3, 1e-3], n + 1) for n in (width, height))
-        limits = axis.get_xlim(), axis.get_ylim()
+        axis.autoscale(False)
         marks = axis.contourf(x, y, padded, levels=[0.5, 1.5], colors=[(1.0, 1.0, 1.0, 0.55)], hatches=["//////"])
         marks.set(edgecolor="0.35", linewidth=0.0)
-        axis.set(xlim=limits[0], ylim=limits[1])
 
 
 class Panels:
