@@ -593,7 +593,7 @@ def _draw_counts(
     # Signal follows the bound: σ ∝ 1/√signal.
     typical = torch.where(hit, sigma, 0.0).flatten(1).sum(1) / hit.flatten(1).sum(1).clamp_min(1)
     each = (typical[:, None, None, None] / bound.clamp_min(1e-9)).square().clamp(0.05, 4.0)
-    each = torch.where(seen.isfinite(), each, 0.0)
+    each = torch.where(seen.isfinite() & ~bound.isnan(), each, 0.0)  # a surface in the dark has no bound
     if subpixels > 1:  # in half of the samples all of them, and in half of these with the noise of few photons
         sees_area, rough = random.coin(0.5, 1, 1, 1), random.coin(0.5, 1, 1, 1)
         each = torch.where(rough & sees_area, -each * torch.log1p(-random.uniform(*each.shape[1:])), each)

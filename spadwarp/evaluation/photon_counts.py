@@ -310,7 +310,7 @@ def photon_frame(
 
     histograms = {
         "counts": counts[None], "background": background[0, 0].astype(np.float32), "response": matrix,
-        "bins": slice(None), "to_depth": to_depth,
+        "bins": slice(None), "gate": depth_gate, "to_depth": to_depth,
     }  # fmt: skip
     return depth_frames(depth, gate=depth_gate, profile=profile), range_from_time(sigma, index), histograms
 

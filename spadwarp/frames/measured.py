@@ -53,6 +53,7 @@ class _Raw(NamedTuple):
     gate_start: float | None = None  # time of flight at the time from which the file counts [s]
     first: float = 0.0  # begin of bin 0 after that time [s]
     ordered: bool = False  # whether the axes are `[H, W, T]` or `[frames, H, W, T]`
+    options: tuple[str, ...] = ()  # what may be given of such a file, beside what every file takes
 
 
 def read_histograms(
@@ -100,10 +101,10 @@ def read_histograms(
             check_real(name, value, within)
     if gate_start is not None:
         check_real("gate_start", gate_start, "[-1, 1] s")
+    given: dict[str, Any] = {"dataset": dataset, "axes": axes, "image_size": image_size, "tag_unit": tag_unit}
     if is_own(path):
-        arguments = {"dataset": dataset, "axes": axes, "image size": image_size, "tag unit": tag_unit, "irf": irf}
-        arguments |= {"bin width": bin_width, "sum frames": sum_frames, "gate start": gate_start}
-        if clash := [name for name, value in arguments.items() if value]:
+        given |= {"irf": irf, "bin_width": bin_width, "sum_frames": sum_frames, "gate_start": gate_start}
+        if clash := [name for name, value in given.items() if value]:
             raise ArgumentError(f"{path}: the file has its own {', '.join(clash)}")
         return _read_own(path, channel)
     if channel != "I":
@@ -112,12 +113,12 @@ def read_histograms(
         raw = _reading(path, _read_ptu, image_size, sum_frames)
     else:
         raw = _reading(path, _read_arrays, dataset, image_size, tag_unit, bin_width)
+    if idle := [name for name, value in given.items() if value is not None and name not in raw.options]:
+        raise ArgumentError(f"{path}: {' and '.join(idle)} cannot be given; it takes {', '.join(raw.options)}")
     values, notes = _checked(raw.values, path), list(raw.notes)
     if not raw.ordered:
         values, note = _ordered(values, axes)
         notes += note
-    elif axes is not None:
-        raise ArgumentError(f"{path}: the file has its own axes")
     if values.dtype.kind == "f":  # as MATLAB writes counts
         whole = values.max() < 2**31 and np.array_equal(values, np.rint(values))
         values = values.astype(np.int32) if whole else values
@@ -262,7 +263,9 @@ def _arrays(path: Path) -> Iterator[dict[str, Variable]]:
 
 def _listed(variables: Mapping[str, Variable]) -> str:
     kinds = {"dense": "", "sparse": " sparse", "cell": " cells"}
-    return ", ".join(f"{name} {one.shape}{kinds[one.kind]}" for name, one in variables.items()) or "no numbers"
+    return (
+        ", ".join(f"{k or 'one without name'} {v.shape}{kinds[v.kind]}" for k, v in variables.items()) or "no numbers"
+    )
 
 
 def _unnamed(path: Path, variables: Mapping[str, Variable]) -> ArgumentError:
@@ -292,9 +295,9 @@ def _read_arrays(
             raise FileError(f"{path}: no array of 3 or 4 dimensions{others}; it holds {_listed(variables)}")
         if dataset is None and len(candidates) > 1 and not is_mat:
             raise _unnamed(path, variables)
-        name = "" if "" in variables else dataset or candidates[0]
+        name = dataset or candidates[0]
         if name not in variables:
-            raise FileError(f"{path}: no array {name!r}; it holds {_listed(variables)}")
+            raise FileError(f"{path}: no array {name!r} (dataset); it holds {_listed(variables)}")
         chosen = variables[name]
         if chosen.kind == "dense":
             _check_size(chosen.shape, "a part of the array")
@@ -310,15 +313,15 @@ def _read_arrays(
         if tag_unit is None:
             raise ArgumentError(f"{path}: the unit of the time tags in {name} is missing (tag_unit)")
         return _of_tags(value, tag_unit, bin_width, notes)
-    width = numbers.get("bin_size", 0.0)
-    known = width if 1e-15 < width < 1e-3 else None
+    known = width if 1e-15 < (width := numbers.get("bin_size", 0.0)) < 1e-3 else None
     if bin_width is None and known is not None:
         notes.append(f"bin width {known * 1e12:g} ps from bin_size")
     is_sparse = isinstance(value, SparseMatrix)
     if is_sparse:
         value = _of_sparse(value, image_size, variables)
         notes.append(f"{value.shape[1]} x {value.shape[0]} pixels, column by column")
-    return _Raw(value, tuple(notes), known, numbers.get("gate_start"), ordered=is_sparse)
+    options = ("dataset", "image_size" if is_sparse else "axes")[not name :]
+    return _Raw(value, tuple(notes), known, numbers.get("gate_start"), ordered=is_sparse, options=options)
 
 
 def _of_sparse(
@@ -345,8 +348,7 @@ def _of_sparse(
 def _of_tags(cells: NDArray[Any], unit: float, bin_width: float | None, notes: list[str]) -> _Raw:
     """Counts from the tags of each pixel `[H, W]`, whole numbers of the unit [s], from the first tag of the image to
     the last, in bins of a multiple of the unit, by default the unit."""
-    width = unit if bin_width is None else bin_width
-    step = round(width / unit)
+    step = round((width := bin_width or unit) / unit)
     if step < 1 or abs(step * unit - width) > 1e-6 * width:
         raise ArgumentError(f"bin width = {width * 1e12:g} ps is not a multiple of the tags' unit, {unit * 1e12:g} ps")
     sizes = np.array([cell.size for cell in cells.flat])
@@ -375,7 +377,7 @@ def _of_tags(cells: NDArray[Any], unit: float, bin_width: float | None, notes: l
     np.add.at(counts, np.repeat(np.arange(cells.size), sizes) * bins + (tags - first) // step, 1)
     text = f"time tags of {across} x {height} pixels, bins of {step * unit * 1e12:g} ps from tag {first}"
     cube = counts.reshape(height, across, bins)
-    return _Raw(cube, (*notes, text), step * unit, first=first * unit, ordered=True)
+    return _Raw(cube, (*notes, text), step * unit, first=first * unit, ordered=True, options=("dataset", "tag_unit"))
 
 
 def stored_images(path: Path, dataset: str | None, *, several: bool) -> tuple[NDArray[Any], str] | None:
@@ -390,15 +392,13 @@ def stored_images(path: Path, dataset: str | None, *, several: bool) -> tuple[ND
         return None
     with _arrays(path) as variables:
         dense = {name: one for name, one in variables.items() if one.kind == "dense"}
-        name, choice = "" if ending == ".npy" else dataset, ""
+        name, choice = "" if ending == ".npy" and dataset is None else dataset, ""
         if name is None:
             sizes = {name: one.shape for name, one in dense.items() if math.prod(one.shape) > 1}
             holds_cubes = any(len(shape) in (3, 4) for shape in sizes.values())
-            sides: tuple[int, ...]
+            sides: tuple[int, ...] = (2,) if not holds_cubes else (3,) if several else ()
             if ending == ".mat":
                 sides = () if _histograms_in(variables) and not several else (2, 3)
-            else:
-                sides = (2,) if not holds_cubes else (3,) if several else ()
             found = [name for name, shape in sizes.items() if len(shape) in sides]
             most = max((math.prod(sizes[name]) for name in found), default=0)
             largest = [name for name in found if math.prod(sizes[name]) == most or ending != ".mat"]
@@ -436,7 +436,7 @@ def _read_ptu(path: Path, image_size: tuple[int, int] | None, sum_frames: bool) 
         is_ours = file.tags.get("CreatorSW_Name") == "spadwarp"
         gate = re.search(r"Bin 0 begins at (\S+) ns of flight", file.comment or "") if is_ours else None
         start = 1e-9 * float(gate[1]) if gate else None
-        return _Raw(counts, tuple(notes), float(file.tcspc_resolution), start, ordered=True)
+        return _Raw(counts, tuple(notes), float(file.tcspc_resolution), start, ordered=True, options=("image_size",))
 
 
 def _check_ptu(file: Any, path: Path) -> None:

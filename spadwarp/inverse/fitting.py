@@ -32,7 +32,7 @@ from spadwarp.inverse.rendering import Half, Renderer
 from spadwarp.inverse.unknowns import BACKGROUND, DEPTH, Unknown, read_unknowns, scene_value, with_values
 from spadwarp.scene import Detector, Scene, SceneLike, as_scene
 from spadwarp.transport import Progress, truth_maps
-from spadwarp.values import SEED, ArgumentError, ConfigError, check_integer, check_real, percent
+from spadwarp.values import SEED, ArgumentError, ConfigError, check_integer, check_real, count, percent
 
 __all__ = ["Bound", "Bounds", "Estimate", "EstimateMap", "Fit", "Fitter", "Iteration", "bounds", "fit"]
 
@@ -422,8 +422,8 @@ class Fitter:
             photons=self.render.photons - first,
             seconds=time.perf_counter() - began,
         )
-        seen = [f"{name}: no light of the targets was seen in the counts, so that it has no value" for name in unseen]
-        return replace(found, warnings=(*agreement.warnings(), *seen, *self._warnings(found, solution)))
+        silent = [f"{name}: {reason}, so that it has no value" for name, reason in unseen.items()]
+        return replace(found, warnings=(*agreement.warnings(), *silent, *self._warnings(found, solution)))
 
     def _lost(self, state: State, halves: list[Half], solution: Solution, trials: Rows) -> Lost:
         """What the fitted unknowns take of the deviance: 2 J⁻¹ − V, with V the covariance, and the slopes."""
@@ -439,10 +439,10 @@ class Fitter:
             np.nan_to_num(2.0 * solution.pixel_bound - solution.pixel_covariance),
         )
 
-    def _forget_unseen(self, expected: Rows, target: Rows, solution: Solution) -> list[str]:
-        """Makes NaN of the solution's variances where the counts hold no light that depends on an unknown; returns the
-        names of such of the whole exposure. `expected`, `target`: mean counts, and those by light of the targets."""
-        counts, unseen = self.exposure.counts, list[str]()
+    def _forget_unseen(self, expected: Rows, target: Rows, solution: Solution) -> dict[str, str]:
+        """Makes NaN of the solution's variances where no light, counted or traced, depends on an unknown; returns those
+        of the whole exposure, and why. `expected`, `target`: mean counts, and those by light of the targets."""
+        counts, unseen = self.exposure.counts, dict[str, str]()
         assert counts is not None
         on_targets = [unknown.name == DEPTH or unknown.name.startswith("targets") for unknown in self.unknowns]
         if any(on_targets):
@@ -454,10 +454,14 @@ class Fitter:
             if unknown.per_pixel:
                 column, seen = self.own.index(unknown), counts.any(axis=1)
                 solution.pixels[~(seen & (each >= _SEEN) if on_target else seen), column] = np.nan
+                continue
+            row = self.shared.index(unknown)
+            if not solution.covariance[row, row] > 0.0:
+                unseen[unknown.name] = f"none of the light of {count(self.photons)} photons depends on it, take more"
             elif on_target and not whole >= _SEEN:
-                row = self.shared.index(unknown)
+                unseen[unknown.name] = "no light of the targets was seen in the counts"
+            if unknown.name in unseen:
                 solution.covariance[row, :] = solution.covariance[:, row] = np.nan
-                unseen.append(unknown.name)
         return unseen
 
     def _initial_state(self, guess: dict[str, float]) -> State:
@@ -825,9 +829,6 @@ def _coarse_step(
 
 def _middle_depth(depth: NDArray[np.floating]) -> float:
     """Depth in the pixel nearest to the middle of the image that sees a target [m]; 0 without any."""
-    rows, columns = np.nonzero(np.isfinite(depth))
-    if not rows.size:
-        return 0.0
-    height, width = depth.shape
-    nearest = np.argmin((rows - 0.5 * (height - 1)) ** 2 + (columns - 0.5 * (width - 1)) ** 2)
-    return float(depth[rows[nearest], columns[nearest]])
+    there = np.argwhere(np.isfinite(depth))
+    away = ((there - 0.5 * (np.array(depth.shape) - 1)) ** 2).sum(axis=1)
+    return float(depth[tuple(there[away.argmin()])]) if len(there) else 0.0

@@ -247,7 +247,8 @@ class _PlacedReceiver(NamedTuple):
 
     def rates(self, light: ExpectedLight) -> Rows:
         """λ of light."""
-        return self._with_change(self.receiver.hazard(light.total).numpy(), light)
+        rows = self.receiver.hazard(light.total).numpy()
+        return np.maximum(self._with_change(rows, light), 0.0)  # the cubic of a shift swings below 0
 
     def slopes(self, slopes: Mapping[str, ExpectedLight], unknowns: Sequence[Unknown]) -> Rows:
         """Derivatives of λ, `[unknown, pixel, bin]`."""
@@ -273,9 +274,7 @@ class _PlacedReceiver(NamedTuple):
 
     def _with_change(self, rows: Rows, light: ExpectedLight) -> Rows:
         """With the light of the targets in its new place, less that in the old."""
-        if self.delay is None:
-            return rows
-        return rows + (self.target(light) - self.receiver.slope(light.target).numpy())
+        return rows if self.delay is None else rows + (self.target(light) - self.receiver.slope(light.target).numpy())
 
 
 def _bins_per_metre(scene: Scene) -> NDArray[np.float64]:

@@ -813,8 +813,8 @@ def _instead(key: Key, info: FieldInfo | None, kind: str, value: Any) -> str:
     if not models:
         return _factor(key, value)
     if not isinstance(value, str):
-        fields = list(models[0].model_fields)
-        return f" of {', '.join(fields[:8])}{', ...' if len(fields) > 8 else ''}"
+        fields, once = list(models[0].model_fields), f", of which there is one; write [{key_text(key)}]"
+        return once if isinstance(value, list) else f" of {', '.join(fields[:8])}{', ...' * (len(fields) > 8)}"
     known = list(PRESETS.get(getattr(models[0], "section", ""), {}))
     if value in known:
         return f'; a preset is taken by {{preset = "{value}"}}'

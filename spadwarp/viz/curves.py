@@ -37,10 +37,7 @@ _OF_PLANS = ("pulses", "sigma_depth", "largest_range")
 
 
 def draw_budget(rows: Sequence[BudgetRow], path: str | Path | None = None, *, width: float = PAGE) -> Figure:
-    """Four panels over range, a line for each water: signal, depth error, signal to backscatter, pulses for 1 cm.
-
-    See `draw_sweep`.
-    """
+    """Signal, depth error, signal to backscatter, pulses for 1 cm over range, a line a water; see `draw_sweep`."""
     waters = tuple((row.range, f"{row.medium}, c = {row.extinction:.3g} 1/m") for row in rows)
     return draw_sweep(Sweep(fields=("range", "water"), values=waters, rows=tuple(rows)), path, width=width)
 
@@ -55,8 +52,8 @@ def draw_sweep(curves: Sweep, path: str | Path | None = None, *, width: float = 
     leaves the light of near water out. A cross at the top: out of reach. Returns the figure of
     this width [inch], and writes it where `path` is given.
     """
-    names = list(_OF_BUDGETS)
-    if not isinstance(curves.rows[0], BudgetRow):
+    names, budgets = list(_OF_BUDGETS), isinstance(curves.rows[0], BudgetRow)
+    if not budgets:
         # Where photons judge nothing, empty panels say so.
         names = [name for name in _OF_PLANS if not np.isnan(curves.column(name)).all()] or list(_OF_PLANS[:2])
     figure, axes = panel_grid(len(names), width, least=2.3, height=2.1, more=0.3)
@@ -65,7 +62,6 @@ def draw_sweep(curves: Sweep, path: str | Path | None = None, *, width: float = 
     numeric = all(isinstance(value, (int, float)) for value in at)
     x = np.array(at, np.float64) if numeric else np.array([ticks.index(str(value)) for value in at], np.float64)
     groups = list(dict.fromkeys(map(repr, others)))
-    budgets = isinstance(curves.rows[0], BudgetRow)
     missed = curves.column("outlier_probability") > OUTLIERS if budgets else np.zeros(len(at), bool)
     moved = curves.column("gate_moved").astype(bool) if budgets else np.zeros(len(at), bool)
     for axis, name in zip(axes, names, strict=True):
@@ -95,7 +91,7 @@ def draw_sweep(curves: Sweep, path: str | Path | None = None, *, width: float = 
         axis.set(xlabel=curves.fields[0] + _unit(curves.fields[0]), ylabel=label)
         _value_axis(axis, np.array([y, *ends]))
         if np.isnan(y).all():
-            axis.text(0.5, 0.5, "not enough photons\nto judge", transform=axis.transAxes, ha="center", va="center")
+            style.middle_text(axis, "not enough photons\nto judge")
             axis.tick_params(axis="y", which="both", left=False, labelleft=False)
             if numeric and np.ptp(x) > 0.0:
                 axis.set_xlim(x.min(), x.max())

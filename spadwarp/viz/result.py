@@ -67,7 +67,7 @@ def plot(
             scene: true depth and reflectance, by ray casting.
         kind: Of a result's figure.
         method: Estimator of a result's depth.
-        frame: Number of the frame.
+        frame: Number of the frame, from 0.
         pixel: Row and column of one more pixel whose histogram, or counts, are shown.
         device: Warp device.
         width: Of the figure [inch]: 7.2 for a journal's page, 3.5 for its column.
@@ -243,6 +243,7 @@ def _result_figure(
         axis.imshow(np.where(np.isfinite(normal), normal, float(style.MISSING)).clip(0.0, 1.0))
         bar.axis("off")
         style.middle_text(bar, "red: right, green: up,\nblue: to the camera")
+        style.middle_text(axis, "" if np.isfinite(normal).any() else "no values")
         panels.show(truth.reflectance, "Reflectance", "Lambertian reflectance", INTENSITY_MAP, (0.0, 1.0))
     else:
         measured = np.asarray(depth, dtype=np.float64)
@@ -355,10 +356,13 @@ def _range_axis(result: Result, axis: Axes, row: int, column: int) -> None:
 
 def _caption(result: Result) -> str:
     photons = style.power_text(result.photons) if result.photons >= 1e6 else count(result.photons)
-    partial = ", interrupted" if result.partial else ""
     light = channel_text(result.provenance.get("channel"))
-    better = "" if result.reconstruction is None else ", reconstructed"
-    return f"{photons} photons{partial}{better}{light}; {_water_text(result.scene.medium)}; seed {result.seed}"
+    return f"{photons} photons{how_made(result)}{light}; {_water_text(result.scene.medium)}; seed {result.seed}"
+
+
+def how_made(result: Result) -> str:
+    """What a caption adds to the photons."""
+    return ", interrupted" * result.partial + ", reconstructed" * (result.reconstruction is not None)
 
 
 def channel_text(channel: str | None) -> str:
@@ -547,7 +551,7 @@ def _frame_figure(
         _plot_counts(shown, counts, file, axis, name, place)
     if axes:
         panels.figure.key(axes, 1.7)
-    which = "all frames added up" if shown.summed else f"frame {shown.first_frame + index + 1}"
+    which = "all frames added up" if shown.summed else f"frame {shown.first_frame + index}"
     mode = "" if file is None else f", {file.scene.detector.mode.replace('_', '-')}{channel_text(file.channel)}"
     noise = hatched or noise_caption(shown.target_noise_ratio)
     panels.figure.caption(f"{which}: {count(shown.pulses)} pulses{mode}; seed {shown.seed}{noise}")
@@ -661,8 +665,7 @@ def draw_denoised(
         target, found = np.isfinite(truth), np.isfinite(denoised)
         missed, invented = target & ~found, found & ~target
         parts = (some.sum() / max(1, of.sum()) for some, of in ((missed, target), (invented, ~target)))
-        of_target, of_water = map(percent, parts)
-        label += f"\nblack: missed, {of_target} %\nred: invented, {of_water} %"
+        label += "\nblack: missed, {} %\nred: invented, {} %".format(*map(percent, parts))
         style.mark_pixels(panels.show_depth(denoised, "Denoised", limits, label), missed, invented)
         panels.show_depth(truth, "Truth", limits)
         panels.show_error(denoised - truth, "Denoised − truth")
@@ -686,7 +689,7 @@ def _fit_figure(fit: Fit, width: float) -> Figure:
         (fit.goodness.pixels, "Deviance", "(deviance − expected) / σ"),
     ):
         reach = max(style.error_limit(image), 1.0)
-        panels.show(image, name, label, style.ERROR_MAP, (-reach, reach))
+        panels.show_scaled(image, name, label, style.ERROR_MAP, (-reach, reach))
     if fit.depth is not None:
         panels.show_depth(fit.depth, "Depth", shown_limits(fit.depth))
     top, bottom = panels.below()
@@ -704,11 +707,15 @@ def _fit_figure(fit: Fit, width: float) -> Figure:
     top.legend(loc="upper right", ncols=2)
     left = (measured - mean) / np.sqrt(np.maximum(mean, 1.0))
     reach = max(3.5, 1.1 * float(np.abs(left).max()))
+    factor, unit = style.power_unit(reach)
     bottom.axhline(0.0, color=TEXT, linewidth=0.6)
-    bottom.plot(0.5 * (edges[:-1] + edges[1:]), left, ".", color=style.RED, markersize=2.5)
-    bottom.set(xlim=edges[[0, -1]], ylim=(-reach, reach), xlabel="time of flight [ns]", ylabel="residual\n/ √fit")
+    bottom.plot(0.5 * (edges[:-1] + edges[1:]), left / factor, ".", color=style.RED, markersize=2.5)
+    bottom.set(xlim=edges[[0, -1]], ylim=(-reach / factor, reach / factor), xlabel="time of flight [ns]")
+    bottom.set_ylabel(f"residual\n/ √fit{unit}")
     values = [
         f"{item.name} = {rounded(item.value, item.standard_error)} ± {item.standard_error:.2g} {item.unit}".rstrip()
+        if np.isfinite(item.value)
+        else f"{item.name}: not known"
         for item in fit.estimates.values()
     ]
     good = f"{'BAD FIT: ' * fit.goodness.is_bad}{fit.goodness.summary()}"
@@ -729,13 +736,9 @@ def progress_bar(unit: str = "photons") -> Callable[[str, int, int], None]:
     Args:
         unit: What is counted, such as "photons", "frames" or "steps".
     """
-    return progress_report(_display() if _in_notebook() else _print, unit)
-
-
-def _in_notebook() -> bool:
-    """Whether a kernel of Jupyter runs this."""
     ipython = sys.modules.get("IPython")
-    return hasattr(ipython.get_ipython(), "kernel") if ipython is not None else False
+    in_notebook = ipython is not None and hasattr(ipython.get_ipython(), "kernel")
+    return progress_report(_display() if in_notebook else _print, unit)
 
 
 def _print(part: float | None, text: str) -> None:

@@ -45,8 +45,6 @@ def draw_water(scene: Scene, path: str | Path, mesh: TriangleMesh | None = None,
     mesh = build_mesh(scene) if mesh is None else mesh
     axes = figure.subplots(1, 2)
     images = [draw_slice(axis, scene, mesh, across) for across, axis in enumerate(axes)]
-    for axis, title in zip(axes, ("from above", "from the side"), strict=True):
-        axis.set_title(title)
     extend = "max" if max(image.get_array().max() for image in images) > images[0].norm.vmax else "neither"
     figure.colorbar(images[0], ax=axes, label="extinction [1/m]", shrink=0.7, extend=extend)
     return save(figure, path)
@@ -79,6 +77,7 @@ def draw_slice(axis: Axes, scene: Scene, mesh: TriangleMesh | None, across: int)
         for ends in _section(mesh, 1 - across):
             axis.plot(ends[:, 2], ends[:, across], color="black", lw=1.2)
     axis.set(xlim=(0.0, depth), ylim=(half, -half), xlabel="z [m]", ylabel="xy"[across] + " [m]")
+    axis.set_title(("from above", "from the side")[across])
     axis.legend(loc="upper left", fontsize=6)
     return image
 

@@ -215,6 +215,13 @@ def power_text(value: float) -> str:
     return f"{float(digits):g}·10{exponent}".removeprefix("1·")
 
 
+def power_unit(largest: float) -> tuple[float, str]:
+    """A power of ten in units of which values up to the largest are short, and what it adds to their label."""
+    exponent = math.floor(math.log10(largest))
+    factor = 1.0 if -2 <= exponent <= 3 else 10.0**exponent
+    return factor, "" if factor == 1.0 else f" [{power_text(factor)}]"
+
+
 def middle_text(axis: Axes, text: str, **style: Any) -> None:
     """Text in place of curves or of an image."""
     axis.text(0.5, 0.5, text, ha="center", va="center", transform=axis.transAxes, **style)
@@ -312,10 +319,9 @@ def hatch(axis: Axes, pixels: NDArray[np.bool_]) -> None:
         padded = np.pad(pixels, 1).repeat(2, axis=0).repeat(2, axis=1)[1:-1, 1:-1].astype(np.float64)
         height, width = pixels.shape  # corners of the pixels, so that one alone is a square
         x, y = (np.repeat(np.arange(n + 1) - 0.5, 2) + np.tile([-1e-3, 1e-3], n + 1) for n in (width, height))
-        limits = axis.get_xlim(), axis.get_ylim()
+        axis.autoscale(False)
         marks = axis.contourf(x, y, padded, levels=[0.5, 1.5], colors=[(1.0, 1.0, 1.0, 0.55)], hatches=["//////"])
         marks.set(edgecolor="0.35", linewidth=0.0)
-        axis.set(xlim=limits[0], ylim=limits[1])
 
 
 class Panels:
@@ -387,7 +393,8 @@ class Panels:
         if scale == "log":
             log_ticks(bar.xaxis, self._line / 0.4)
         else:
-            colour_bar.locator = MaxNLocator(nbins=max(2, min(6, int(self._line / 0.45))))
+            digits = len(f"{abs(high):.0f}") + max(1, math.ceil(-math.log10(high - low)) + 2)
+            colour_bar.locator = MaxNLocator(nbins=max(1, min(6, int(self._line / max(0.45, 0.08 * digits)))))
             colour_bar.formatter = ScalarFormatter(useOffset=False)
             bar.xaxis.minorticks_on()
         return axis
@@ -413,7 +420,7 @@ class Panels:
         """From 0 to the 99.5th percentile, which single bright pixels exceed."""
         values = image.astype(np.float64)
         top = float(np.percentile(values, 99.5)) or float(values.max()) or 1.0
-        self._show_scaled(values, title, label, INTENSITY_MAP, (0.0, top))
+        self.show_scaled(values, title, label, INTENSITY_MAP, (0.0, top))
 
     def show_positive(self, values: NDArray[Any], title: str, label: str, colours: str = BOUND_MAP) -> None:
         """Positive values between their 5th and 95th percentile; on a logarithmic scale if these are far apart."""
@@ -423,15 +430,14 @@ class Panels:
         if high > 4.0 * low:
             self.show(shown, title, label, colours, (low, high), "log")
         else:  # a single value has no interval
-            self._show_scaled(shown, title, label, colours, (low - 0.05 * high, 1.05 * high))
+            self.show_scaled(shown, title, label, colours, (low - 0.05 * high, 1.05 * high))
 
-    def _show_scaled(
-        self, values: NDArray[Any], title: str, label: str, colours: str, limits: tuple[float, float]
+    def show_scaled(
+        self, values: NDArray[Any], title: str, label: str, colours: str | Colormap, limits: tuple[float, float]
     ) -> None:
         """Values in units of a power of ten, which the label names, unless they are short by themselves."""
-        exponent = math.floor(math.log10(limits[1]))
-        factor = 1.0 if -2 <= exponent <= 3 else 10.0**exponent
-        label += "" if factor == 1.0 else f" [{power_text(factor)}]"
+        factor, unit = power_unit(limits[1])
+        label += unit
         self.show(values / factor, title, label, colours, (limits[0] / factor, limits[1] / factor))
 
 

@@ -28,7 +28,7 @@ from spadwarp.scene import Scene
 from spadwarp.scene.sight import lines_of_sight
 from spadwarp.values import ArgumentError, FileError, check_choice, check_integer, check_real, count
 from spadwarp.viz import style
-from spadwarp.viz.result import channel_text, middle_plane
+from spadwarp.viz.result import channel_text, how_made, middle_plane
 from spadwarp.viz.style import PaperFigure, colour_map, median_pixel, paper
 
 __all__ = ["video", "view"]
@@ -121,10 +121,10 @@ def _of_result(result: Result, method: str | None, device: Any) -> _Page:
     per_pulse = scene.laser.photons_per_pulse * scene.detections_per_photon
     # In a scan the positions' numbers of photons differ by one at most.
     scale = float(result.tally_value.mean()) * per_pulse
+    cubes = zip(scene.components, result.tallies, strict=True)
     chosen: Any = method or "centroid"
-    partial = ", interrupted" if result.partial else ""
     return _Page(
-        caption=f"{count(result.photons)} photons, seed {result.seed}, {scene.transport.estimator}{partial}"
+        caption=f"{count(result.photons)} photons{how_made(result)}, seed {result.seed}, {scene.transport.estimator}"
         f"{channel_text(result.provenance.get('channel'))}; expected histograms, before the instrument response",
         scene=scene,
         depth=result.depth(method=chosen, device=device),
@@ -133,10 +133,7 @@ def _of_result(result: Result, method: str | None, device: Any) -> _Page:
         reflectance=result.truth.reflectance,
         intensity=result.intensity * per_pulse,
         intensity_label="detections per pulse",
-        layers=[
-            _layer(*style.COMPONENTS[name], cube, scale)
-            for name, cube in zip(scene.components, result.tallies, strict=True)
-        ],
+        layers=[_layer(*style.COMPONENTS[name], cube, scale) for name, cube in cubes],
         edges=result.bin_edges,
         unit="detections per pulse and bin",
         response=detector_response(scene.detector, scene.laser),
@@ -517,9 +514,8 @@ def _write_gif(pictures: Iterator[NDArray[np.uint8]], path: Path, fps: float) ->
         # One palette for all pictures, from the colour bar in the first, so that colours do not flicker.
         palette = image.quantize(255, Image.Quantize.MAXCOVERAGE) if palette is None else palette
         frames.append(image.quantize(palette=palette, dither=Image.Dither.NONE))
-    frames[0].save(
-        path, format="GIF", save_all=True, append_images=frames[1:], duration=round(1000 / fps), loop=0, optimize=False
-    )
+    options: dict[str, Any] = {"duration": round(1000 / fps), "loop": 0, "optimize": False}
+    frames[0].save(path, format="GIF", save_all=True, append_images=frames[1:], **options)
 
 
 def _write_mp4(pictures: Iterator[NDArray[np.uint8]], path: Path, fps: float) -> None:

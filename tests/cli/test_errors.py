@@ -111,7 +111,7 @@ sweep SCENE --vary range=1:10cm:5 | is ambiguous
 sweep SCENE --vary medium.typo=1:2:2 --out OUT | medium.typo
 sweep SCENE --vary nonsense --out OUT | from:to:count
 sweep SCENE --medium uwoc-cleer | uwoc-clear
-depth DONE --out OUT --input bin_width=5ps | the file has its own bin width
+depth DONE --out OUT --input bin_width=5ps | the file has its own bin_width
 depth SCENE --out OUT --input bin_with=5ps | 'bin_with' is not one of bin_width, gate_start, irf
 depth SCENE --out OUT --input image_size=5 | image_size = '5' is not of the form WIDTHxHEIGHT
 denoise SCENE --out OUT --gate 90ns:110ns | group_index

@@ -126,8 +126,15 @@ WIDER = r"are .* a wider bin than 4 ps \(bin_width\) would help"
         ("furthest.mat", {"tag_unit": 4e-12}, r"beyond 2\^62|not all whole"),
         ("flat.mat", {}, r"image's size is missing \(image_size\): 15 pixels"),
         ("two.h5", {}, r"dataset is missing \(dataset\); the file holds a \(3, 5, 40\), b"),
-        ("two.h5", {"dataset": "big"}, r"no array 'big'; it holds a \(3, 5, 40\)"),
+        ("two.h5", {"dataset": "big"}, r"no array 'big' \(dataset\); it holds a \(3, 5, 40\)"),
         ("counts.npy", {"axes": "xxt"}, "are not the letters of"),
+        ("counts.npy", {"dataset": "hits"}, r"no array 'hits' \(dataset\); it holds one without name \(3, 5, 40\)"),
+        (
+            "counts.npy",
+            {"tag_unit": 4e-12, "image_size": (3, 5)},
+            "image_size and tag_unit cannot .*; it takes axes",
+        ),
+        ("flat.mat", {"image_size": (3, 5), "axes": "yxt"}, "axes cannot be given; it takes dataset, image_size"),
         (
             "counts.npy",
             {"bin_width": 5e-11, "irf": instrument_response(pulse_fwhm=0.0, jitter_fwhm=300.0)},

@@ -2,6 +2,7 @@
 
 import dataclasses
 import math
+import sys
 import tomllib
 from types import SimpleNamespace
 
@@ -84,12 +85,10 @@ def test_a_bar_on_a_terminal_counts_to_the_end(capsys):
 
 def test_a_bar_in_a_notebook_is_one_that_changes(monkeypatch):
     display = pytest.importorskip("IPython.display")
-    from spadwarp.viz import result as notebook
-
     shown = []
     handle = SimpleNamespace(update=lambda html: shown.append(html.data))
     monkeypatch.setattr(display, "display", lambda html, display_id: shown.append(html.data) or handle)
-    monkeypatch.setattr(notebook, "_in_notebook", lambda: True)
+    monkeypatch.setitem(sys.modules, "IPython", SimpleNamespace(get_ipython=lambda: SimpleNamespace(kernel=True)))
     bar = spadwarp.viz.progress_bar("frames")
     for stage, done, total in (("compile", 0, 0), ("<note>", 0, 0), ("frames", 1, 4), ("frames", 4, 4)):
         bar(stage, done, total)
