@@ -74,11 +74,7 @@ def test_examples_go_by_name(tmp_path, monkeypatch):
 # JSON Schema
 
 
-MODELS = {
-    "scenes": spadwarp.Scene,
-    "datasets": spadwarp.dataset.Recipe,
-    "training": spadwarp.denoise.TrainingRecipe,
-}
+MODELS = {"scenes": spadwarp.Scene, "datasets": spadwarp.dataset.Recipe, "training": spadwarp.denoise.TrainingRecipe}
 
 
 @functools.cache

@@ -73,10 +73,7 @@ def test_what_is_read_is_never_replaced(done, tmp_path):
     (tmp_path / "link").symlink_to(done)
     refused("view", done, "--out", source, words=("--out", "result.h5"))
     refused("view", tmp_path / "link", "--out", source, "--overwrite", words=("does not end in .html",))
-    for command in (
-        ("merge", done, "--out", done),
-        ("depth", depth, "--out", tmp_path, "--input", "bin_width=100ps"),
-    ):
+    for command in (("merge", done, "--out", done), ("depth", depth, "--out", tmp_path, "--input", "bin_width=100ps")):
         refused(*command, "--overwrite", words=("is read by this command",))
     refused("depth", done, "--out", tmp_path / "out", "--ply", depth, words=("--ply", "exists"))
     assert (source.read_bytes(), depth.read_bytes()) == before

@@ -5,6 +5,8 @@ import os
 import random
 import re
 import signal
+import sys
+import time
 
 import numpy as np
 import pytest
@@ -16,7 +18,7 @@ from helpers.datasets import checksums, recipe
 from helpers.runs import PHOTONS, RUN, same
 from helpers.scenes import scene
 from spadwarp import RunOptions, simulate
-from spadwarp.parallel import Ray, interruptible, run_jobs
+from spadwarp.parallel import Forked, Ray, interruptible, run_jobs
 
 ENGINES = {"here": {"device": "cpu"}, "processes": {"device": "cpu,cpu"}, "ray": {"engine": Ray(workers=2)}}
 
@@ -188,3 +190,51 @@ def test_a_dataset_whose_worker_is_killed_has_the_files_of_a_local_one(cluster, 
 
     spadwarp.dataset.make_dataset(small, tmp_path / "ray", engine=Ray(workers=2), progress=progress)
     assert killer.lost == 1 and checksums(tmp_path / "ray") == checksums(tmp_path / "here")
+
+
+# Calls in copies of this process
+
+
+def test_calls_return_in_order_from_processes_of_their_own():
+    held = list(range(100_000))
+    calls = [lambda k=k: (k, len(held), os.getpid()) for k in range(3)]
+    with Forked(calls) as forked:
+        found = forked.results()
+    assert [one[:2] for one in found] == [(k, 100_000) for k in range(3)]
+    own = {one[2] for one in found}
+    assert len(own) == 3 and os.getpid() not in own if sys.platform == "linux" else own == {os.getpid()}
+
+
+def test_what_fails_in_a_copy_is_made_here():
+    here = os.getpid()
+
+    def only_here():
+        return "here" if os.getpid() == here else os._exit(3)
+
+    def fails():
+        raise ValueError("as it says")
+
+    with Forked([only_here]) as forked:
+        assert forked.results() == ["here"]
+    with Forked([fails]) as forked, pytest.raises(ValueError, match="as it says"):
+        forked.results()
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="calls are made here")
+def test_none_outlives_its_context(tmp_path, monkeypatch):
+    """Nor an interrupt while results are awaited, which is raised as it is."""
+
+    def slow():
+        time.sleep(0.5)
+        (tmp_path / "late").touch()
+
+    def interrupted(*_):
+        raise KeyboardInterrupt
+
+    with pytest.raises(RuntimeError, match="full"), Forked([slow]):
+        raise RuntimeError("full")
+    monkeypatch.setattr("multiprocessing.connection.Connection.poll", interrupted)
+    with pytest.raises(KeyboardInterrupt), Forked([slow, slow]) as forked:
+        forked.results()
+    time.sleep(0.8)
+    assert not (tmp_path / "late").exists()

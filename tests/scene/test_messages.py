@@ -76,10 +76,7 @@ def port(*names, **fields):
         # Water
         ({"medium": {}}, TWO_OF),
         (medium(scattering=0.1), TWO_OF),
-        (
-            {"medium": {"absorption": 0.4, "extinction": 0.3}},
-            "absorption = 0.4 is outside [0, 0.3] 1/m, 0.3 being",
-        ),
+        ({"medium": {"absorption": 0.4, "extinction": 0.3}}, "absorption = 0.4 is outside [0, 0.3] 1/m, 0.3 being"),
         ({"medium": {"absorption": 0.1, "albedo": 1.0}}, "medium.albedo = 1.0 leaves the extinction undetermined"),
         ({"medium": {"chlorophyll": 0.5, "preset": "uwoc-clear"}}, "chlorophyll = 0.5 cannot be combined with preset"),
         ({"medium": {"chlorophyll": 0.5}, **laser(wavelength_nm=850.0)}, "wavelength_nm = 850.0 is outside [400, 700]"),
@@ -102,10 +99,7 @@ def port(*names, **fields):
         ("daylight={sun_elevation_deg=45}", "daylight.depth is missing (of the lens below the surface [m])"),
         ({**medium(layers=[LAYER]), "daylight": {"sun_elevation_deg": 60.0, "depth": 5.0}}, "daylight takes one water"),
         # Walls
-        (
-            {"domain": {"shape": "slab", "lower": 3, "upper": 1}},
-            "lower = 3.0 is outside (-inf, 1.0) m, 1.0 being",
-        ),
+        ({"domain": {"shape": "slab", "lower": 3, "upper": 1}}, "lower = 3.0 is outside (-inf, 1.0) m, 1.0 being"),
         ('domain={shape="box", upper=[1, 1]}', "domain.upper = [1, 1] has the wrong number of values; 3 are needed"),
         ("domain={outside_index={y_low=1.0}}", "no such face with shape = 'unbounded'; a slab has z_low and z_high"),
         (BOX + ", outside_index={y_lw=1.0}}", "did you mean 'y_low'?"),

@@ -108,10 +108,7 @@ def facets(zenith, mean_square_slope, index):
 @pytest.mark.physics
 def test_irradiance_below_a_rough_surface():
     """Sun at 60° and wind of 5 m/s over water that does not scatter: all that gets in is absorbed far below."""
-    scene = sea(
-        medium={"absorption": 1e-6, "scattering": 0.0},
-        surface={"mean_square_slope": None, "wind": 5.0},
-    )
+    scene = sea(medium={"absorption": 1e-6, "scattering": 0.0}, surface={"mean_square_slope": None, "wind": 5.0})
     found = spadwarp.simulate(scene, photons=200_000, seed=1, device="cpu")
     light, report = found.flux["depths"]["irradiance"], found.energy_report()
     down, scalar = facets(math.radians(60.0), 0.0286, 1.34)

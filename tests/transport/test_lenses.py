@@ -146,9 +146,7 @@ def test_layers_of_water_stand_in_the_world(device):
     pose, apart = rotation_matrix((10.0, 20.0, 30.0)), {"translation": [0.0, 0.0, -400.0]}
     around = {"domain": {"shape": "box", "lower": -900.0, "upper": 900.0}, "targets": [PLATE | apart]}
     here = scene(
-        medium={"layers": layers, "layer_axis": [0.6, 0.0, 0.8]},
-        camera={"rotation_deg": [10.0, 20.0, 30.0]},
-        **around,
+        medium={"layers": layers, "layer_axis": [0.6, 0.0, 0.8]}, camera={"rotation_deg": [10.0, 20.0, 30.0]}, **around
     )
     start = float(turn @ [0.6, 0.0, 0.8] @ shift)
     moved = [{**layer, "start": layer["start"] + start} for layer in layers]

@@ -199,10 +199,7 @@ def test_waves_and_shots_stay_on_their_side():
     low = {"point": [0.0, 0.0, 0.1], "waves": {"size": 40.0, "cells": 64}}
     rising = {"camera": {"width": 2, "height": 2}, "scan": {**SCAN, "velocity": [0.0, 0.0, 400.0]}}
     for sections, text in (
-        (
-            {"surface": low, "laser": {"position": [0.0] * 3}},
-            r"camera\.position: 0\.1 m .* waves of up to 0\.\d+ m",
-        ),
+        ({"surface": low, "laser": {"position": [0.0] * 3}}, r"camera\.position: 0\.1 m .* waves of up to 0\.\d+ m"),
         (
             {"surface": {"waves": {**WAVES, "shortest": 0.0625}}},
             r"surface\.waves: heights: the waves hold .* outside \[0, 0\.9\]",

@@ -28,8 +28,7 @@ WIDE = {"shape": "box", "lower": -60.0, "upper": 60.0}  # that no light of the g
 )
 @pytest.mark.filterwarnings("ignore:.*rounding to the histogram's unit:RuntimeWarning")  # nearly black targets
 @pytest.mark.parametrize(
-    ("estimator", "termination"),
-    [pytest.param("next_event", "cutoff", marks=pytest.mark.slow), ("guided", "roulette")],
+    ("estimator", "termination"), [pytest.param("next_event", "cutoff", marks=pytest.mark.slow), ("guided", "roulette")]
 )
 def test_the_ledger_closes_exactly(estimator, termination, **values):
     """Emitted weight = the sum of all entries, in integers, for random waters, limits and targets in a box of water."""
