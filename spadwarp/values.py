@@ -20,7 +20,6 @@ import os
 import re
 import reprlib
 import sys
-import tomllib
 import types
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from fractions import Fraction
@@ -579,15 +578,42 @@ def time_from_range(distance: Any, group_index: float) -> Any:
 
 _PREFIXES = {"f": -15, "p": -12, "n": -9, "u": -6, "µ": -6, "μ": -6, "m": -3, "": 0, "k": 3, "M": 6, "G": 9}
 
+_RADIAN = Fraction(180 / math.pi)  # [°]
+
+# A kind of quantity with its article, an example, the unit that takes prefixes, and units without them.
+_KINDS: tuple[tuple[str, str, str, dict[str, Fraction]], ...] = (
+    ("a length", "1 cm", "m", {"cm": Fraction(1, 100)}),
+    ("a time", "50 ps", "s", {"min": Fraction(60), "h": Fraction(3600)}),
+    (
+        "a frequency",
+        "20 MHz",
+        "Hz",
+        {"1/s": Fraction(1), "/s": Fraction(1), "cps": Fraction(1), "kcps": Fraction(10**3), "Mcps": Fraction(10**6)},
+    ),
+    ("an energy", "150 nJ", "J", {}),
+    ("a power", "20 mW", "W", {}),
+    ("an angle", "12 deg", "", {"deg": Fraction(1), "°": Fraction(1), "rad": _RADIAN, "mrad": _RADIAN / 1000}),
+    (
+        "a coefficient",
+        "0.3 1/m",
+        "",
+        dict.fromkeys(("1/m", "/m", "m^-1", "m-1", "m⁻¹"), Fraction(1))
+        | {"1/cm": Fraction(100), "1/km": Fraction(1, 1000)},
+    ),
+    ("a concentration", "0.5 mg/m³", "", dict.fromkeys(("mg/m³", "mg/m3", "mg/m^3", "µg/L", "ug/L"), Fraction(1))),
+    ("a speed", "5 m/s", "", {"m/s": Fraction(1), "km/h": Fraction(5, 18), "kn": Fraction(1852, 3600)}),
+    ("a salinity", "35 g/kg", "", {"g/kg": Fraction(1)}),
+    ("a temperature", "20 °C", "", {"°C": Fraction(1), "degC": Fraction(1)}),
+    ("a ratio", "20 %", "", {"1": Fraction(1), "%": Fraction(1, 100)}),
+)
+
 
 def _unit_table() -> dict[str, tuple[str, str, Fraction]]:
     """Kind, example and factor of every unit."""
     table: dict[str, tuple[str, str, Fraction]] = {}
-    for kind in tomllib.loads(Path(__file__).with_name("units.toml").read_text(encoding="utf-8"))["kinds"]:
-        base, prefixes = kind["base"], _PREFIXES.items() if kind["base"] else ()
-        factors = {prefix + base: Fraction(10) ** power for prefix, power in prefixes}
-        factors |= {unit: Fraction(number) / over for unit, (number, over) in kind["units"].items()}
-        table |= {unit: (kind["name"], kind["example"], factor) for unit, factor in factors.items()}
+    for kind, example, base, others in _KINDS:
+        scaled = {prefix + base: Fraction(10) ** power for prefix, power in _PREFIXES.items()} if base else {}
+        table |= {unit: (kind, example, factor) for unit, factor in {**scaled, **others}.items()}
     del table["mHz"]  # for MHz, more often than not
     return table
 

@@ -3,9 +3,7 @@
 from __future__ import annotations
 
 import os
-import tomllib
 from dataclasses import dataclass, replace
-from importlib.resources import files
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Self
 
@@ -32,8 +30,25 @@ __all__ = ["AnalyticFile", "AnalyticResult", "simulate_analytic"]
 _FORMAT, _FORMAT_VERSION = "spadwarp analytic", 1
 _PART_PIXELS = 1 << 26  # of frames that are drawn at a time: 0.3 GB
 _PART_BYTES = 1 << 28  # of frames that are held at a time while a file is written
-_TABLES = tomllib.loads((files("spadwarp.analytic") / "maps.toml").read_text(encoding="utf-8"))
-_MAPS: dict[str, str] = _TABLES["maps"]
+_READ_ME = (
+    "Depth frames [frame, height, width] in metres along z, NaN for no estimate; labels: the pixel reports background "
+    "light. maps/: signal, backscatter and alpha are expected detections per pulse within the gate, arrival and "
+    "sigma_time are seconds, sigma_depth metres, fisher 1/s^2 per detected photon. "
+    "Camera frame: +x right, +y down, +z forward."
+)
+_MAPS = {
+    "signal": "1",
+    "arrival": "s",
+    "backscatter": "1",
+    "alpha": "1",
+    "fisher": "s^-2",
+    "sigma_time": "s",
+    "sigma_depth": "m",
+    "signal_to_backscatter": "1",
+    "background_level": "1",
+    "outlier_probability": "1",
+    "background_probability": "1",
+}
 # Dimensions, unit and meaning of the arrays of a file, by name.
 _ARRAYS = {
     **{f"maps/{name}": (PIXELS, unit, name.replace("_", " ")) for name, unit in _MAPS.items()},
@@ -165,7 +180,7 @@ class AnalyticResult(Shown):
         attributes = {
             "format": _FORMAT,
             "format_version": _FORMAT_VERSION,
-            "read_me": _TABLES["read_me"],
+            "read_me": _READ_ME,
             "version": __version__,
             "source": str(scene.source or ""),
             "seed": str(self.seed),
