@@ -643,6 +643,7 @@ def quantity(text: str, unit: str) -> float:
         raise ValueError(f"has no unit; write {number} without quotes for {unit}, or {example!r}")
     if given not in UNITS:
         meant = " or ".join(repr(f"{number} {one}") for one in UNITS if one.casefold() == given.casefold())
+        meant = meant or repr(text.replace(",", ".")) * (given[0] == ",")
         hint = f"did you mean {meant}?" if meant else f"e.g. {example!r}"
         raise ValueError(f"has the unit {given!r}, which is not known; {hint}")
     other, _, given_factor = UNITS[given]

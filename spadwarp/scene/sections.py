@@ -244,9 +244,9 @@ class Section(_Model):
         merged = cls._kept(base, layer)
         dropped = [name for name, value in layer.items() if value is None]
         for name in layer:
-            merged[name] = _over(table_of(cls, name), base.get(name), layer[name], f"{at}.{name}".lstrip("."))
-        for name in dropped:
-            del merged[name]
+            over = table_of(cls, name), base.get(name), layer[name], f"{at}.{name}".lstrip(".")
+            merged[name] = _over(*over) if name in cls.model_fields else layer[name]
+        merged = {name: value for name, value in merged.items() if name not in dropped}
         preset = cls._preset(merged)
         if preset is not None and any(name in preset.values for name in dropped):
             del merged["preset"]  # no longer that preset
