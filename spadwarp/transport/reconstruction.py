@@ -13,6 +13,7 @@
 from __future__ import annotations
 
 import bisect
+import itertools
 import math
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
@@ -24,10 +25,11 @@ from numpy.typing import NDArray
 
 import spadwarp_kernels as sk
 from spadwarp.device import pick_device
-from spadwarp.mesh import build_mesh
+from spadwarp.mesh import TriangleMesh, build_mesh
 from spadwarp.result import Reconstruction, Result
 from spadwarp.scene import Scene
 from spadwarp.scene.camera import image_tangents
+from spadwarp.scene.scene import camera_port
 from spadwarp.scene.sight import lines_of_sight
 from spadwarp.transport.model import build_model, trace_rays
 from spadwarp.transport.simulation import DEFAULT_TIME
@@ -48,7 +50,7 @@ _FINE = 4  # parts of a bin: light that is less than a bin late moves to the nex
 _DELAYS = ((0, 1), (1, 2), (2, 4), (4, 8), (8, 16), (16, 32), (32, 64), (64, 192))
 _EVEN_DELAYS = ((0, 4), (4, 16), (16, 64), (64, 256))
 _BLURRED_DELAYS = ((0, 1), (1, 3), (3, 8), (8, 20), (20, 50))
-_BLURS = (1, 3, 8, 20)  # of two boxes [pixels]
+_BLURS = (1, 3, 8, 20, None)  # of two boxes [pixels], and over the whole image
 _DEEPEST = 80.0  # optical depth whose exponential float32 holds
 _ROW = 8  # a row of bins is as wide as this part of its distance from the true path
 # Radii of the windows, in pixels and rows, and of the one over which their errors are averaged.
@@ -56,7 +58,7 @@ _WINDOWS = ((0, 0), (1, 0), (2, 0), (4, 0), (8, 0), (16, 0), (32, 0), (4, 1), (8
 _AROUND = ((3, 1), (16, 1))
 _ROW_WINDOWS, _ROW_AROUND = tuple((0, reach) for reach in (0, 1, 2, 4, 8, 16)), ((0, 8),)  # of sums over all pixels
 _COST = 1e-6, 5e-8  # seconds that a bin takes on two cores, on a GPU
-_FLOOR = 1e-3  # of the mean: forward-scattered light where none is predicted
+_FLOOR = 0.02  # of a bin's mean over pixels: forward-scattered light where none is predicted
 
 
 def tracing_time(scene: Scene, time: float | None, device: str | None = None) -> float:
@@ -74,6 +76,7 @@ class KnownLight(NamedTuple):
     even: Any  # surfaces in even light
     span: Any  # first and last fine bin with light
     covered: Any  # the part of a pixel whose surface has light of a bin or of an earlier one, by bin
+    first: int  # the first bin that light of any surface can reach
 
 
 def reconstruct(result: Result, *, device: str | None = None) -> Result:
@@ -119,7 +122,9 @@ def reconstruct(result: Result, *, device: str | None = None) -> Result:
         else:
             predicted = _backscatter(known.covered.numpy().reshape(mean.shape), mean) if k else ballistic
         predicted = predicted * np.float32(mean.sum(dtype=np.float64) / max(predicted.sum(dtype=np.float64), 1e-300))
-        predicted += np.float32(k == 1) * _FLOOR * mean.mean()
+        if k < 2:
+            predicted += np.float32(k * _FLOOR) * _course(mean.mean(axis=(0, 1)), known.first)
+            predicted[..., : known.first] = 0.0
         found[k], square = _smoothed(parts, mean, predicted, rows if k < 2 else plain, scattered=k > 0)
         return square
 
@@ -130,11 +135,12 @@ def reconstruct(result: Result, *, device: str | None = None) -> Result:
 
 def known_light(scene: Scene, focus: float | None, device: wp.Device) -> KnownLight:
     """From truth rays, also of a lens with this focus [m]."""
-    camera, gate = scene.camera, scene.gate
-    model, pixels = build_model(scene, device, build_mesh(scene), camera=False), camera.height * camera.width
+    camera, gate, mesh = scene.camera, scene.gate, build_mesh(scene)
+    model, pixels = build_model(scene, device, mesh, camera=False), camera.height * camera.width
     light = wp.zeros((3, pixels, gate.bins * _FINE), dtype=float, device=device)
     covered = wp.zeros((pixels, gate.bins), dtype=float, device=device)
-    known = KnownLight(light[0], light[1], light[2], wp.zeros(pixels, dtype=wp.vec2i, device=device), covered)
+    span: Any = wp.zeros(pixels, dtype=wp.vec2i, device=device)
+    known = KnownLight(light[0], light[1], light[2], span, covered, _first_bin(scene, mesh))
     radius = 0.0 if camera.pinhole or camera.port is not None or focus is None else camera.aperture_radius
     places, lens = (part[:, None, None] for part in _places(radius))
     height = max(1, _RAYS // (len(places) * camera.width))
@@ -221,6 +227,32 @@ def _footprint(scene: Scene, direction: NDArray[np.float64]) -> NDArray[np.float
     return np.exp(-2.0 * (cosine**-2 - 1.0) / math.tan(beam.half_angle) ** 2) / cosine**3
 
 
+def _first_bin(scene: Scene, mesh: TriangleMesh | None) -> int:
+    """The first bin that light of any surface, in view or not, can reach: no way by a point is faster than the
+    unscattered one (Fermat). Triangles that may hold the fastest are divided."""
+    beam, camera, gate = scene.beam, scene.camera, scene.gate
+    if mesh is None:
+        return gate.bins
+    light = lines_of_sight(scene)
+    ways = light, replace(light, laser=np.zeros(3), laser_port=camera_port(scene))
+    radii = beam.beam_radius * (beam.profile == "collimated") + camera.aperture_radius * (not camera.pinhole)
+    corners, size = mesh.vertices.astype(np.float64)[mesh.faces], math.inf
+    near_enough = 0.1 * scene.medium.pulse_speed * gate.bin_width
+    while size > near_enough and len(corners) < _RAYS:
+        middle = corners.mean(axis=1)
+        reach = np.linalg.norm(corners - middle[:, None], axis=-1).max(axis=1)
+        path = sum(np.nan_to_num(way.light_at(middle)[2]) for way in ways)  # type: ignore[misc]
+        least = path - 2.0 * reach
+        near, shortest = least <= path.min(), least.min()
+        size = reach[near].max()
+        a, b, c = corners[near].swapaxes(0, 1)
+        ab, bc, ca = 0.5 * (a + b), 0.5 * (b + c), 0.5 * (c + a)
+        parts = (a, ab, ca), (ab, b, bc), (ca, bc, c), (ab, bc, ca)
+        corners = np.concatenate([np.stack(part, axis=1) for part in parts])
+    first = ((shortest - radii) / scene.medium.pulse_speed - gate.start) / gate.bin_width
+    return int(np.clip(math.floor(first), 0, gate.bins))
+
+
 def _edges(low: int, high: int) -> NDArray[np.int64]:
     """Edges of rows of bins around 0, from at most `low` to at least `high`."""
     ends = [0]
@@ -258,6 +290,25 @@ class _Rows:
         return np.take_along_axis(values, index, axis=-1)
 
 
+def _course(light: Any, first: int) -> Any:
+    """The course of light over bins, from the means of rows that count from the first bin."""
+    ends = _edges(0, len(light) - first) + first
+    ends = np.minimum(ends, len(light))
+    means = [light[low:high].mean() for low, high in itertools.pairwise(ends) if high > low]
+    middles = 0.5 * (ends[:-1] + ends[1:] - 1)[: len(means)]
+    return np.interp(np.arange(len(light)), middles, means).astype(np.float32) if means else light
+
+
+def _blurred(light: Cube, radius: int | None) -> Cube:
+    """Light by two boxes of this radius, or by one of the whole image."""
+    from scipy.ndimage import uniform_filter
+
+    if radius is None:
+        return np.broadcast_to(light.mean(axis=(0, 1)), light.shape)
+    size = (2 * radius + 1, 2 * radius + 1, 1)
+    return uniform_filter(uniform_filter(light, size, mode="constant"), size, mode="constant")
+
+
 def _forward(known: KnownLight, ballistic: Cube, rows: _Rows, bins: _Rows, light: Cube) -> Cube:
     """Prediction of forward-scattered light from its tallies."""
     from scipy.ndimage import uniform_filter
@@ -271,9 +322,8 @@ def _forward(known: KnownLight, ballistic: Cube, rows: _Rows, bins: _Rows, light
     first, last = (lit[0], lit[-1] + 1) if len(lit) else (0, 0)
     span = wp.full(len(known.span), wp.vec2i(int(first), int(last)), dtype=wp.vec2i, device=device)
     for radius in _BLURS:
-        box = {"size": (2 * radius + 1, 2 * radius + 1, 1), "mode": "constant"}
         blurred = np.zeros_like(ballistic)
-        blurred[..., first:last] = uniform_filter(uniform_filter(ballistic[..., first:last], **box), **box)
+        blurred[..., first:last] = _blurred(ballistic[..., first:last], radius)
         pixels: Any = wp.array(blurred.reshape(flat), dtype=float, device=device)
         terms += [(pixels, span, delay, 1) for delay in _BLURRED_DELAYS]
     columns = np.stack([rows.delayed(*term).numpy().ravel() for term in terms])
