@@ -48,9 +48,8 @@ _RAYS = 1 << 16  # at a time
 _FINE = 4  # parts of a bin: light that is less than a bin late moves to the next
 # Delays [fine bins] of direct light and of surfaces in even light; of blurred light [bins], by the blur's radius.
 _DELAYS = ((0, 1), (1, 2), (2, 4), (4, 8), (8, 16), (16, 32), (32, 64), (64, 192))
-_EVEN_DELAYS = ((0, 4), (4, 16), (16, 64), (64, 256))
-_BLURRED_DELAYS = ((0, 1), (1, 3), (3, 8), (8, 20), (20, 50))
-_BLURS = (1, 3, 8, 20, None)  # of two boxes [pixels], and over the whole image
+_BLURRED_DELAYS = ((0, 1), (1, 3), (3, 8), (8, 20), (20, 50), (50, 150))
+_BLURS = (0, 1, 3, 8, 20, None)  # of two boxes [pixels], and over the whole image
 _DEEPEST = 80.0  # optical depth whose exponential float32 holds
 _ROW = 8  # a row of bins is as wide as this part of its distance from the true path
 # Radii of the windows, in pixels and rows, and of the one over which their errors are averaged.
@@ -315,17 +314,17 @@ def _forward(known: KnownLight, ballistic: Cube, rows: _Rows, bins: _Rows, light
     from scipy.optimize import nnls
 
     device, flat = rows.device, (known.direct.shape[0], ballistic.shape[-1])
-    terms: list[Any] = [(known.direct, known.span, delay, _FINE) for delay in _DELAYS]
-    terms += [(known.scattered, known.span, delay, _FINE) for delay in _DELAYS]
-    terms += [(known.even, known.span, delay, _FINE) for delay in _EVEN_DELAYS]
-    lit = np.flatnonzero(ballistic.any(axis=(0, 1)))
-    first, last = (lit[0], lit[-1] + 1) if len(lit) else (0, 0)
-    span = wp.full(len(known.span), wp.vec2i(int(first), int(last)), dtype=wp.vec2i, device=device)
-    for radius in _BLURS:
-        blurred = np.zeros_like(ballistic)
-        blurred[..., first:last] = _blurred(ballistic[..., first:last], radius)
-        pixels: Any = wp.array(blurred.reshape(flat), dtype=float, device=device)
-        terms += [(pixels, span, delay, 1) for delay in _BLURRED_DELAYS]
+    terms: list[Any] = [(fine, known.span, delay, _FINE) for fine in (known.direct, known.scattered) for delay in _DELAYS]
+    even = bins.delayed(known.even, known.span, (0, 1), _FINE).numpy().reshape(bins.shape)
+    lit = np.flatnonzero(even.any(axis=(0, 1)))
+    first, last = (int(lit[0]), int(lit[-1]) + 1) if len(lit) else (0, 0)
+    span = wp.full(len(known.span), wp.vec2i(first, last), dtype=wp.vec2i, device=device)
+    for sharp, radii in ((ballistic, _BLURS[1:]), (even, _BLURS)):
+        for radius in radii:
+            blurred = np.zeros_like(sharp)
+            blurred[..., first:last] = _blurred(sharp[..., first:last], radius)
+            pixels: Any = wp.array(blurred.reshape(flat), dtype=float, device=device)
+            terms += [(pixels, span, delay, 1) for delay in _BLURRED_DELAYS]
     columns = np.stack([rows.delayed(*term).numpy().ravel() for term in terms])
     columns /= (sums := np.maximum(columns.sum(axis=1), 1e-30))[:, None]
     light = rows.summed(light)
