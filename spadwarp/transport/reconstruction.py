@@ -1,8 +1,9 @@
 """Reconstruction: the light that few photons left noisy, from what is known of the scene without noise.
 
 1. Truth rays within each pixel, with the laser's footprint, shadows, cosines and attenuation, give the ballistic light
-   up to a factor. Light that scattered forward on its way is this light later and blurred, or lights the surfaces
-   evenly; backscatter ends at the first surface. Non-negative least squares of such terms predict each component.
+   up to a factor. Light that scattered forward on its way is this light, or that of surfaces lit from all around the
+   laser, later and blurred, and none comes before the shortest way by any surface; backscatter ends at the first one.
+   Non-negative least squares of such terms predict each component.
 2. The ratio of the tallies to the prediction is smooth. It is averaged over windows of pixels and rows of bins, counted
    from the pixel's own true path and wider far from it, and the windows are blended by their squared errors.
 3. These come from two independent halves of the photons: the product of the halves' residuals has the squared bias as
@@ -13,7 +14,6 @@
 from __future__ import annotations
 
 import bisect
-import itertools
 import math
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
@@ -46,10 +46,10 @@ _LENS = 4  # times as many rays where they meet the lens at different points
 _STEPS = np.array([0.7548776662, 0.5698402910])  # additive sequence in two dimensions (Roberts 2018)
 _RAYS = 1 << 16  # at a time
 _FINE = 4  # parts of a bin: light that is less than a bin late moves to the next
-# Delays [fine bins] of direct light and of surfaces in even light; of blurred light [bins], by the blur's radius.
-_DELAYS = ((0, 1), (1, 2), (2, 4), (4, 8), (8, 16), (16, 32), (32, 64), (64, 192))
+# Delays of direct light [fine bins], and of light blurred [bins] by boxes of these radii [pixels] or the whole image.
+_DELAYS = ((0, 1), (1, 2), (2, 4), (4, 8), (8, 16), (16, 64))
 _BLURRED_DELAYS = ((0, 1), (1, 3), (3, 8), (8, 20), (20, 50), (50, 150))
-_BLURS = (0, 1, 3, 8, 20, None)  # of two boxes [pixels], and over the whole image
+_BLURS = (0, 2, 8, None)
 _DEEPEST = 80.0  # optical depth whose exponential float32 holds
 _ROW = 8  # a row of bins is as wide as this part of its distance from the true path
 # Radii of the windows, in pixels and rows, and of the one over which their errors are averaged.
@@ -72,7 +72,7 @@ class KnownLight(NamedTuple):
 
     direct: Any  # ballistic light
     scattered: Any  # the same times the scattering on its way, as light that scattered forward has
-    even: Any  # surfaces in even light
+    even: Any  # surfaces in light from all around the laser
     span: Any  # first and last fine bin with light
     covered: Any  # the part of a pixel whose surface has light of a bin or of an earlier one, by bin
     first: int  # the first bin that light of any surface can reach
@@ -168,7 +168,7 @@ def known_light(scene: Scene, focus: float | None, device: wp.Device) -> KnownLi
 
 def _trace(scene: Scene, model: sk.Model, places: Any, lens: Any, focus: float | None) -> tuple[Any, Any, Any]:
     """Of rays through places of the image and points of the lens `[ray, H, W]`: time [fine bin], NaN for none, its
-    widths along both axes of the image, ballistic light and that of a surface in even light."""
+    widths along both axes of the image, and three kinds of light as in `KnownLight`."""
     camera, gate, shape = scene.camera, scene.gate, places.shape[:-1]
     view = np.concatenate([image_tangents(camera, places), np.ones((*shape, 1))], axis=-1)
     view -= lens / (focus or math.inf)
@@ -186,10 +186,15 @@ def _trace(scene: Scene, model: sk.Model, places: Any, lens: Any, focus: float |
     begin = point - direction * way[..., None]
     free = trace(begin, direction)[0]
     lit = ~(free < way * (1.0 - 1e-4) - 1e-3) * _footprint(scene, direction)
-    lit *= np.maximum(-(direction * normal).sum(axis=-1), 0.0) / way**2
+    cosine = -(direction * normal).sum(axis=-1)
+    lit *= np.maximum(cosine, 0.0) / way**2
     depth = scene.optical_depth(start, point) + scene.optical_depth(begin, point)
-    even = reflectance * np.exp(-depth) / slant[..., 0] ** 4
-    scattered = even * lit * np.expm1(np.minimum(depth * scene.medium.range.albedo, _DEEPEST))
+    # Light that scattered on its way comes from around the laser: a radiance like the cosine to its direction.
+    angle = np.arccos(np.clip(cosine, -1.0, 1.0))
+    surface = reflectance * np.exp(-depth) / slant[..., 0] ** 4
+    even = surface * (np.sin(angle) + (math.pi - angle) * np.cos(angle)) / math.pi
+    ballistic = surface * lit
+    scattered = ballistic * np.expm1(np.minimum(depth * scene.medium.range.albedo, _DEEPEST))
     fine = _FINE / (scene.medium.pulse_speed * gate.bin_width)
     time = (path + along + lines.delay) * fine - gate.start / gate.bin_width * _FINE
     # Each ray stands for the part of the surface around it, whose times differ along both axes of the image.
@@ -201,7 +206,7 @@ def _trace(scene: Scene, model: sk.Model, places: Any, lens: Any, focus: float |
         slopes.append(along * (moved * (lines.direction + direction)).sum(axis=-1) * fine)
     wide, narrow = np.maximum(*np.abs(slopes)), np.minimum(*np.abs(slopes))
     time[~np.isfinite(even + lit + wide)] = np.nan
-    return time, np.stack([np.maximum(wide, 1e-3), narrow], axis=-1), np.stack([even * lit, scattered, even], axis=-1)
+    return time, np.stack([np.maximum(wide, 1e-3), narrow], axis=-1), np.stack([ballistic, scattered, even], axis=-1)
 
 
 def _places(radius: float) -> tuple[NDArray[Any], NDArray[Any]]:
@@ -291,21 +296,21 @@ class _Rows:
 
 def _course(light: Any, first: int) -> Any:
     """The course of light over bins, from the means of rows that count from the first bin."""
-    ends = _edges(0, len(light) - first) + first
-    ends = np.minimum(ends, len(light))
-    means = [light[low:high].mean() for low, high in itertools.pairwise(ends) if high > low]
-    middles = 0.5 * (ends[:-1] + ends[1:] - 1)[: len(means)]
-    return np.interp(np.arange(len(light)), middles, means).astype(np.float32) if means else light
+    ends = np.unique(np.minimum(_edges(0, len(light) - first) + first, len(light)))
+    if len(ends) < 2:
+        return light
+    means = np.add.reduceat(light, ends[:-1]) / np.diff(ends)
+    return np.interp(np.arange(len(light)), 0.5 * (ends[:-1] + ends[1:] - 1), means).astype(np.float32)
 
 
 def _blurred(light: Cube, radius: int | None) -> Cube:
-    """Light by two boxes of this radius, or by one of the whole image."""
+    """Light by two boxes of this radius, or its mean over the image."""
     from scipy.ndimage import uniform_filter
 
     if radius is None:
         return np.broadcast_to(light.mean(axis=(0, 1)), light.shape)
-    size = (2 * radius + 1, 2 * radius + 1, 1)
-    return uniform_filter(uniform_filter(light, size, mode="constant"), size, mode="constant")
+    box: Any = {"size": (2 * radius + 1, 2 * radius + 1, 1), "mode": "constant"}
+    return uniform_filter(uniform_filter(light, **box), **box)
 
 
 def _forward(known: KnownLight, ballistic: Cube, rows: _Rows, bins: _Rows, light: Cube) -> Cube:
@@ -314,7 +319,9 @@ def _forward(known: KnownLight, ballistic: Cube, rows: _Rows, bins: _Rows, light
     from scipy.optimize import nnls
 
     device, flat = rows.device, (known.direct.shape[0], ballistic.shape[-1])
-    terms: list[Any] = [(fine, known.span, delay, _FINE) for fine in (known.direct, known.scattered) for delay in _DELAYS]
+    terms: list[Any] = [
+        (fine, known.span, delay, _FINE) for fine in (known.direct, known.scattered) for delay in _DELAYS
+    ]
     even = bins.delayed(known.even, known.span, (0, 1), _FINE).numpy().reshape(bins.shape)
     lit = np.flatnonzero(even.any(axis=(0, 1)))
     first, last = (int(lit[0]), int(lit[-1]) + 1) if len(lit) else (0, 0)
