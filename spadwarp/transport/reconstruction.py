@@ -57,7 +57,7 @@ _WINDOWS = ((0, 0), (1, 0), (2, 0), (4, 0), (8, 0), (16, 0), (32, 0), (4, 1), (8
 _AROUND = ((3, 1), (16, 1))
 _ROW_WINDOWS, _ROW_AROUND = tuple((0, reach) for reach in (0, 1, 2, 4, 8, 16)), ((0, 8),)  # of sums over all pixels
 _COST = 1e-6, 5e-8  # seconds that a bin takes on two cores, on a GPU
-_FLOOR = 0.02  # of a bin's mean over pixels: forward-scattered light where none is predicted
+_FLOOR, _SMOOTH = 0.02, 15  # forward-scattered light where none is predicted, of the mean over pixels and these bins
 
 
 def tracing_time(scene: Scene, time: float | None, device: str | None = None) -> float:
@@ -90,7 +90,7 @@ def reconstruct(result: Result, *, device: str | None = None) -> Result:
     Raises `ConfigError`: fewer than two batches of photons, the surface of the sea, a moving scan; what `simulate`
     raises of the scene's files.
     """
-    from scipy.ndimage import distance_transform_edt
+    from scipy.ndimage import distance_transform_edt, uniform_filter
 
     halves, scene, gate = result.halves, result.scene, result.scene.gate
     if not scene.has_straight_sight:
@@ -122,7 +122,7 @@ def reconstruct(result: Result, *, device: str | None = None) -> Result:
             predicted = _backscatter(known.covered.numpy().reshape(mean.shape), mean) if k else ballistic
         predicted = predicted * np.float32(mean.sum(dtype=np.float64) / max(predicted.sum(dtype=np.float64), 1e-300))
         if k < 2:
-            predicted += np.float32(k * _FLOOR) * _course(mean.mean(axis=(0, 1)), known.first)
+            predicted += np.float32(k * _FLOOR) * uniform_filter(mean.mean(axis=(0, 1)), _SMOOTH)
             predicted[..., : known.first] = 0.0
         found[k], square = _smoothed(parts, mean, predicted, rows if k < 2 else plain, scattered=k > 0)
         return square
@@ -240,19 +240,21 @@ def _first_bin(scene: Scene, mesh: TriangleMesh | None) -> int:
     light = lines_of_sight(scene)
     ways = light, replace(light, laser=np.zeros(3), laser_port=camera_port(scene))
     radii = beam.beam_radius * (beam.profile == "collimated") + camera.aperture_radius * (not camera.pinhole)
-    corners, size = mesh.vertices.astype(np.float64)[mesh.faces], math.inf
-    near_enough = 0.1 * scene.medium.pulse_speed * gate.bin_width
-    while size > near_enough and len(corners) < _RAYS:
+    corners, enough = mesh.vertices.astype(np.float64)[mesh.faces], 0.1 * scene.medium.pulse_speed * gate.bin_width
+    while True:
         middle = corners.mean(axis=1)
         reach = np.linalg.norm(corners - middle[:, None], axis=-1).max(axis=1)
-        path = sum(np.nan_to_num(way.light_at(middle)[2]) for way in ways)  # type: ignore[misc]
+        path = np.zeros(len(middle))
+        for way in ways:  # behind a port as in its air, whose index is about 1
+            straight = np.linalg.norm(middle - way.laser, axis=-1) / scene.medium.group_index
+            path += np.fmax(way.light_at(middle)[2], straight)
         least = path - 2.0 * reach
         near, shortest = least <= path.min(), least.min()
-        size = reach[near].max()
+        if reach[near].max() < enough or near.sum() > _RAYS:
+            break
         a, b, c = corners[near].swapaxes(0, 1)
         ab, bc, ca = 0.5 * (a + b), 0.5 * (b + c), 0.5 * (c + a)
-        parts = (a, ab, ca), (ab, b, bc), (ca, bc, c), (ab, bc, ca)
-        corners = np.concatenate([np.stack(part, axis=1) for part in parts])
+        corners = np.stack([a, ab, ca, ab, b, bc, ca, bc, c, ab, bc, ca], axis=1).reshape(-1, 3, 3)
     first = ((shortest - radii) / scene.medium.pulse_speed - gate.start) / gate.bin_width
     return int(np.clip(math.floor(first), 0, gate.bins))
 
@@ -292,15 +294,6 @@ class _Rows:
         row_of = np.repeat(np.arange(self.count), np.diff(self._edges))
         index = row_of[np.arange(self.shape[-1]) - self._start[..., None] - self._edges[0]]
         return np.take_along_axis(values, index, axis=-1)
-
-
-def _course(light: Any, first: int) -> Any:
-    """The course of light over bins, from the means of rows that count from the first bin."""
-    ends = np.unique(np.minimum(_edges(0, len(light) - first) + first, len(light)))
-    if len(ends) < 2:
-        return light
-    means = np.add.reduceat(light, ends[:-1]) / np.diff(ends)
-    return np.interp(np.arange(len(light)), 0.5 * (ends[:-1] + ends[1:] - 1), means).astype(np.float32)
 
 
 def _blurred(light: Cube, radius: int | None) -> Cube:
