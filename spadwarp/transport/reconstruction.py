@@ -1,8 +1,9 @@
 """Reconstruction: the light that few photons left noisy, from what is known of the scene without noise.
 
 1. Truth rays within each pixel, with the laser's footprint, shadows, cosines and attenuation, give the ballistic light
-   up to a factor. Light that scattered forward on its way is this light later and blurred, or lights the surfaces
-   evenly; backscatter ends at the first surface. Non-negative least squares of such terms predict each component.
+   up to a factor. Light that scattered forward on its way is this light, or that of surfaces lit from all around the
+   laser, later and blurred, and none comes before the shortest way by any surface; backscatter ends at the first one.
+   Non-negative least squares of such terms predict each component.
 2. The ratio of the tallies to the prediction is smooth. It is averaged over windows of pixels and rows of bins, counted
    from the pixel's own true path and wider far from it, and the windows are blended by their squared errors.
 3. These come from two independent halves of the photons: the product of the halves' residuals has the squared bias as
@@ -24,10 +25,11 @@ from numpy.typing import NDArray
 
 import spadwarp_kernels as sk
 from spadwarp.device import pick_device
-from spadwarp.mesh import build_mesh
+from spadwarp.mesh import TriangleMesh, build_mesh
 from spadwarp.result import Reconstruction, Result
 from spadwarp.scene import Scene
 from spadwarp.scene.camera import image_tangents
+from spadwarp.scene.scene import camera_port
 from spadwarp.scene.sight import lines_of_sight
 from spadwarp.transport.model import build_model, trace_rays
 from spadwarp.transport.simulation import DEFAULT_TIME
@@ -44,11 +46,10 @@ _LENS = 4  # times as many rays where they meet the lens at different points
 _STEPS = np.array([0.7548776662, 0.5698402910])  # additive sequence in two dimensions (Roberts 2018)
 _RAYS = 1 << 16  # at a time
 _FINE = 4  # parts of a bin: light that is less than a bin late moves to the next
-# Delays [fine bins] of direct light and of surfaces in even light; of blurred light [bins], by the blur's radius.
-_DELAYS = ((0, 1), (1, 2), (2, 4), (4, 8), (8, 16), (16, 32), (32, 64), (64, 192))
-_EVEN_DELAYS = ((0, 4), (4, 16), (16, 64), (64, 256))
-_BLURRED_DELAYS = ((0, 1), (1, 3), (3, 8), (8, 20), (20, 50))
-_BLURS = (1, 3, 8, 20)  # of two boxes [pixels]
+# Delays of direct light [fine bins], and of light blurred [bins] by boxes of these radii [pixels] or the whole image.
+_DELAYS = ((0, 1), (1, 2), (2, 4), (4, 8), (8, 16), (16, 64))
+_BLURRED_DELAYS = ((0, 1), (1, 3), (3, 8), (8, 20), (20, 50), (50, 150))
+_BLURS = (0, 2, 8, None)
 _DEEPEST = 80.0  # optical depth whose exponential float32 holds
 _ROW = 8  # a row of bins is as wide as this part of its distance from the true path
 # Radii of the windows, in pixels and rows, and of the one over which their errors are averaged.
@@ -56,7 +57,7 @@ _WINDOWS = ((0, 0), (1, 0), (2, 0), (4, 0), (8, 0), (16, 0), (32, 0), (4, 1), (8
 _AROUND = ((3, 1), (16, 1))
 _ROW_WINDOWS, _ROW_AROUND = tuple((0, reach) for reach in (0, 1, 2, 4, 8, 16)), ((0, 8),)  # of sums over all pixels
 _COST = 1e-6, 5e-8  # seconds that a bin takes on two cores, on a GPU
-_FLOOR = 1e-3  # of the mean: forward-scattered light where none is predicted
+_FLOOR, _SMOOTH = 0.02, 15  # forward-scattered light where none is predicted, of the mean over pixels and these bins
 
 
 def tracing_time(scene: Scene, time: float | None, device: str | None = None) -> float:
@@ -71,9 +72,10 @@ class KnownLight(NamedTuple):
 
     direct: Any  # ballistic light
     scattered: Any  # the same times the scattering on its way, as light that scattered forward has
-    even: Any  # surfaces in even light
+    even: Any  # surfaces in light from all around the laser
     span: Any  # first and last fine bin with light
     covered: Any  # the part of a pixel whose surface has light of a bin or of an earlier one, by bin
+    first: int  # the first bin that light of any surface can reach
 
 
 def reconstruct(result: Result, *, device: str | None = None) -> Result:
@@ -88,7 +90,7 @@ def reconstruct(result: Result, *, device: str | None = None) -> Result:
     Raises `ConfigError`: fewer than two batches of photons, the surface of the sea, a moving scan; what `simulate`
     raises of the scene's files.
     """
-    from scipy.ndimage import distance_transform_edt
+    from scipy.ndimage import distance_transform_edt, uniform_filter
 
     halves, scene, gate = result.halves, result.scene, result.scene.gate
     if not scene.has_straight_sight:
@@ -119,7 +121,9 @@ def reconstruct(result: Result, *, device: str | None = None) -> Result:
         else:
             predicted = _backscatter(known.covered.numpy().reshape(mean.shape), mean) if k else ballistic
         predicted = predicted * np.float32(mean.sum(dtype=np.float64) / max(predicted.sum(dtype=np.float64), 1e-300))
-        predicted += np.float32(k == 1) * _FLOOR * mean.mean()
+        if k < 2:
+            predicted += np.float32(k * _FLOOR) * uniform_filter(mean.mean(axis=(0, 1)), _SMOOTH)
+            predicted[..., : known.first] = 0.0
         found[k], square = _smoothed(parts, mean, predicted, rows if k < 2 else plain, scattered=k > 0)
         return square
 
@@ -130,11 +134,12 @@ def reconstruct(result: Result, *, device: str | None = None) -> Result:
 
 def known_light(scene: Scene, focus: float | None, device: wp.Device) -> KnownLight:
     """From truth rays, also of a lens with this focus [m]."""
-    camera, gate = scene.camera, scene.gate
-    model, pixels = build_model(scene, device, build_mesh(scene), camera=False), camera.height * camera.width
+    camera, gate, mesh = scene.camera, scene.gate, build_mesh(scene)
+    model, pixels = build_model(scene, device, mesh, camera=False), camera.height * camera.width
     light = wp.zeros((3, pixels, gate.bins * _FINE), dtype=float, device=device)
     covered = wp.zeros((pixels, gate.bins), dtype=float, device=device)
-    known = KnownLight(light[0], light[1], light[2], wp.zeros(pixels, dtype=wp.vec2i, device=device), covered)
+    span: Any = wp.zeros(pixels, dtype=wp.vec2i, device=device)
+    known = KnownLight(light[0], light[1], light[2], span, covered, _first_bin(scene, mesh))
     radius = 0.0 if camera.pinhole or camera.port is not None or focus is None else camera.aperture_radius
     places, lens = (part[:, None, None] for part in _places(radius))
     height = max(1, _RAYS // (len(places) * camera.width))
@@ -163,7 +168,7 @@ def known_light(scene: Scene, focus: float | None, device: wp.Device) -> KnownLi
 
 def _trace(scene: Scene, model: sk.Model, places: Any, lens: Any, focus: float | None) -> tuple[Any, Any, Any]:
     """Of rays through places of the image and points of the lens `[ray, H, W]`: time [fine bin], NaN for none, its
-    widths along both axes of the image, ballistic light and that of a surface in even light."""
+    widths along both axes of the image, and three kinds of light as in `KnownLight`."""
     camera, gate, shape = scene.camera, scene.gate, places.shape[:-1]
     view = np.concatenate([image_tangents(camera, places), np.ones((*shape, 1))], axis=-1)
     view -= lens / (focus or math.inf)
@@ -181,10 +186,15 @@ def _trace(scene: Scene, model: sk.Model, places: Any, lens: Any, focus: float |
     begin = point - direction * way[..., None]
     free = trace(begin, direction)[0]
     lit = ~(free < way * (1.0 - 1e-4) - 1e-3) * _footprint(scene, direction)
-    lit *= np.maximum(-(direction * normal).sum(axis=-1), 0.0) / way**2
+    cosine = -(direction * normal).sum(axis=-1)
+    lit *= np.maximum(cosine, 0.0) / way**2
     depth = scene.optical_depth(start, point) + scene.optical_depth(begin, point)
-    even = reflectance * np.exp(-depth) / slant[..., 0] ** 4
-    scattered = even * lit * np.expm1(np.minimum(depth * scene.medium.range.albedo, _DEEPEST))
+    # Light that scattered on its way comes from around the laser: a radiance like the cosine to its direction.
+    angle = np.arccos(np.clip(cosine, -1.0, 1.0))
+    surface = reflectance * np.exp(-depth) / slant[..., 0] ** 4
+    even = surface * (np.sin(angle) + (math.pi - angle) * np.cos(angle)) / math.pi
+    ballistic = surface * lit
+    scattered = ballistic * np.expm1(np.minimum(depth * scene.medium.range.albedo, _DEEPEST))
     fine = _FINE / (scene.medium.pulse_speed * gate.bin_width)
     time = (path + along + lines.delay) * fine - gate.start / gate.bin_width * _FINE
     # Each ray stands for the part of the surface around it, whose times differ along both axes of the image.
@@ -196,7 +206,7 @@ def _trace(scene: Scene, model: sk.Model, places: Any, lens: Any, focus: float |
         slopes.append(along * (moved * (lines.direction + direction)).sum(axis=-1) * fine)
     wide, narrow = np.maximum(*np.abs(slopes)), np.minimum(*np.abs(slopes))
     time[~np.isfinite(even + lit + wide)] = np.nan
-    return time, np.stack([np.maximum(wide, 1e-3), narrow], axis=-1), np.stack([even * lit, scattered, even], axis=-1)
+    return time, np.stack([np.maximum(wide, 1e-3), narrow], axis=-1), np.stack([ballistic, scattered, even], axis=-1)
 
 
 def _places(radius: float) -> tuple[NDArray[Any], NDArray[Any]]:
@@ -219,6 +229,34 @@ def _footprint(scene: Scene, direction: NDArray[np.float64]) -> NDArray[np.float
     if beam.profile == "uniform_cone":
         return (cosine >= math.cos(beam.half_angle)).astype(np.float64)
     return np.exp(-2.0 * (cosine**-2 - 1.0) / math.tan(beam.half_angle) ** 2) / cosine**3
+
+
+def _first_bin(scene: Scene, mesh: TriangleMesh | None) -> int:
+    """The first bin that light of any surface, in view or not, can reach: no way by a point is faster than the
+    unscattered one (Fermat). Triangles that may hold the fastest are divided."""
+    beam, camera, gate = scene.beam, scene.camera, scene.gate
+    if mesh is None:
+        return gate.bins
+    light = lines_of_sight(scene)
+    ways = light, replace(light, laser=np.zeros(3), laser_port=camera_port(scene))
+    radii = beam.beam_radius * (beam.profile == "collimated") + camera.aperture_radius * (not camera.pinhole)
+    corners, enough = mesh.vertices.astype(np.float64)[mesh.faces], 0.1 * scene.medium.pulse_speed * gate.bin_width
+    while True:
+        middle = corners.mean(axis=1)
+        reach = np.linalg.norm(corners - middle[:, None], axis=-1).max(axis=1)
+        path = np.zeros(len(middle))
+        for way in ways:  # behind a port as in its air, whose index is about 1
+            straight = np.linalg.norm(middle - way.laser, axis=-1) / scene.medium.group_index
+            path += np.fmax(way.light_at(middle)[2], straight)
+        least = path - 2.0 * reach
+        near, shortest = least <= path.min(), least.min()
+        if reach[near].max() < enough or near.sum() > _RAYS:
+            break
+        a, b, c = corners[near].swapaxes(0, 1)
+        ab, bc, ca = 0.5 * (a + b), 0.5 * (b + c), 0.5 * (c + a)
+        corners = np.stack([a, ab, ca, ab, b, bc, ca, bc, c, ab, bc, ca], axis=1).reshape(-1, 3, 3)
+    first = ((shortest - radii) / scene.medium.pulse_speed - gate.start) / gate.bin_width
+    return int(np.clip(math.floor(first), 0, gate.bins))
 
 
 def _edges(low: int, high: int) -> NDArray[np.int64]:
@@ -258,24 +296,35 @@ class _Rows:
         return np.take_along_axis(values, index, axis=-1)
 
 
+def _blurred(light: Cube, radius: int | None) -> Cube:
+    """Light by two boxes of this radius, or its mean over the image."""
+    from scipy.ndimage import uniform_filter
+
+    if radius is None:
+        return np.broadcast_to(light.mean(axis=(0, 1)), light.shape)
+    box: Any = {"size": (2 * radius + 1, 2 * radius + 1, 1), "mode": "constant"}
+    return uniform_filter(uniform_filter(light, **box), **box)
+
+
 def _forward(known: KnownLight, ballistic: Cube, rows: _Rows, bins: _Rows, light: Cube) -> Cube:
     """Prediction of forward-scattered light from its tallies."""
     from scipy.ndimage import uniform_filter
     from scipy.optimize import nnls
 
     device, flat = rows.device, (known.direct.shape[0], ballistic.shape[-1])
-    terms: list[Any] = [(known.direct, known.span, delay, _FINE) for delay in _DELAYS]
-    terms += [(known.scattered, known.span, delay, _FINE) for delay in _DELAYS]
-    terms += [(known.even, known.span, delay, _FINE) for delay in _EVEN_DELAYS]
-    lit = np.flatnonzero(ballistic.any(axis=(0, 1)))
-    first, last = (lit[0], lit[-1] + 1) if len(lit) else (0, 0)
-    span = wp.full(len(known.span), wp.vec2i(int(first), int(last)), dtype=wp.vec2i, device=device)
-    for radius in _BLURS:
-        box = {"size": (2 * radius + 1, 2 * radius + 1, 1), "mode": "constant"}
-        blurred = np.zeros_like(ballistic)
-        blurred[..., first:last] = uniform_filter(uniform_filter(ballistic[..., first:last], **box), **box)
-        pixels: Any = wp.array(blurred.reshape(flat), dtype=float, device=device)
-        terms += [(pixels, span, delay, 1) for delay in _BLURRED_DELAYS]
+    terms: list[Any] = [
+        (fine, known.span, delay, _FINE) for fine in (known.direct, known.scattered) for delay in _DELAYS
+    ]
+    even = bins.delayed(known.even, known.span, (0, 1), _FINE).numpy().reshape(bins.shape)
+    lit = np.flatnonzero(even.any(axis=(0, 1)))
+    first, last = (int(lit[0]), int(lit[-1]) + 1) if len(lit) else (0, 0)
+    span = wp.full(len(known.span), wp.vec2i(first, last), dtype=wp.vec2i, device=device)
+    for sharp, radii in ((ballistic, _BLURS[1:]), (even, _BLURS)):
+        for radius in radii:
+            blurred = np.zeros_like(sharp)
+            blurred[..., first:last] = _blurred(sharp[..., first:last], radius)
+            pixels: Any = wp.array(blurred.reshape(flat), dtype=float, device=device)
+            terms += [(pixels, span, delay, 1) for delay in _BLURRED_DELAYS]
     columns = np.stack([rows.delayed(*term).numpy().ravel() for term in terms])
     columns /= (sums := np.maximum(columns.sum(axis=1), 1e-30))[:, None]
     light = rows.summed(light)

@@ -9,6 +9,7 @@ from scipy.ndimage import maximum_filter, uniform_filter
 
 import spadwarp
 import spadwarp_kernels as sk
+from spadwarp.mesh import build_mesh
 from spadwarp.result import COMPONENTS, Result
 
 
@@ -33,6 +34,18 @@ def test_ballistic_light_has_no_floor_at_depths_of_other_pixels(runs: tuple[Resu
     dark = ~maximum_filter(few | other, (3, 3, 7))
     assert dark.mean() > 0.5
     assert (runs[0].expected("ballistic")[dark] > 0.0).mean() < 0.03  # sides of steps that a pixel's rays graze
+
+
+def test_no_light_of_a_surface_comes_before_any_can_arrive(runs: tuple[Result, Result]) -> None:
+    scene = runs[0].scene
+    corners = build_mesh(scene).vertices[build_mesh(scene).faces].astype(np.float64)
+    points = np.einsum("nc,fcx->nfx", np.random.default_rng(1).dirichlet((0.5, 0.5, 0.5), 1000), corners)
+    path = np.linalg.norm(points, axis=-1) + np.linalg.norm(points - scene.laser.position, axis=-1)
+    first = int((path.min() / scene.medium.pulse_speed - scene.gate.start) / scene.gate.bin_width)
+    assert first > 10
+    for name in ("ballistic", "forward_scattered"):
+        light = runs[0].expected(name).sum(axis=(0, 1))
+        assert not light[: first - 1].any() and light[first + 1] > 0.0
 
 
 def test_no_light_is_negative_so_that_counts_can_be_drawn(runs: tuple[Result, Result]) -> None:
