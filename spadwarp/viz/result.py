@@ -427,7 +427,7 @@ def _profiles(result: Result, section: str, left: Axes, right: Axes) -> None:
         label = kind.replace("_", " ")
         error = None if light.errors is None else light.errors[:, k]
         left.errorbar(values, position, xerr=error, fmt=".-", color=style.SERIES[k], label=label, linewidth=0.9)
-    left.set(xlabel=f"irradiance per photon [{light.unit}]", title=section)
+    left.set(xlabel=f"irradiance per photon [{light.unit.replace('^2', '²')}]", title=section)
     log_axis(left, "x")
     below: dict[str, Any] = {"fontsize": 6.5, "loc": "upper center", "bbox_to_anchor": (0.5, -0.2)}
     left.legend(**below, ncols=2)
@@ -466,7 +466,7 @@ def _slice(figure: Figure, axis: Axes, section: str, light: FluxValues, planes: 
     look: Any = {"norm": LogNorm(_LEAST * top, top), "cmap": style.colour_map(INTENSITY_MAP)}
     look |= {"interpolation": "nearest", "extent": (*ends[0], ends[1][1], ends[1][0])}
     shown = axis.imshow(np.maximum(found.sum(axis=0), _LEAST * top), **look)
-    figure.colorbar(shown, ax=axis, label=f"fluence [{light.unit}]", shrink=0.6)
+    figure.colorbar(shown, ax=axis, label="fluence [1/m²] per photon", shrink=0.6)
 
 
 # Bins wide enough to mean something

@@ -57,6 +57,7 @@ class _Page:
     edges: NDArray[np.float64]
     unit: str
     response: InstrumentResponse
+    sparse: bool = False  # histograms of few photons
     reflectance: NDArray[Any] | None = None
 
 
@@ -94,9 +95,7 @@ def view(
     check_apart(path, source)
     held = source if isinstance(source, Held) else load(source)
     if isinstance(held, SequenceFile):
-        raise ArgumentError(
-            f"{held.path} holds a scene that moves: `spadwarp view --out NAME.gif` shows it, frame by frame"
-        )
+        raise ArgumentError(f"{held.path} holds a scene that moves: `spadwarp view --out NAME.gif` shows it")
     if isinstance(held, Result):
         page = _of_result(analyser_channel(held, channel), method, device)
     elif channel != "I":
@@ -119,9 +118,10 @@ def _layer(label: str, colour: str, cube: NDArray[Any], factor: float = 1.0, *, 
 def _of_result(result: Result, method: str | None, device: Any) -> _Page:
     scene = result.scene
     per_pulse = scene.laser.photons_per_pulse * scene.detections_per_photon
+    smooth = result.reconstruction
     # In a scan the positions' numbers of photons differ by one at most.
-    scale = float(result.tally_value.mean()) * per_pulse
-    cubes = zip(scene.components, result.tallies, strict=True)
+    scale = per_pulse * (float(result.tally_value.mean()) if smooth is None else 1.0)
+    cubes = zip(scene.components, result.tallies if smooth is None else smooth.histogram, strict=True)
     chosen: Any = method or "centroid"
     return _Page(
         caption=f"{count(result.photons)} photons{how_made(result)}, seed {result.seed}, {scene.transport.estimator}"
@@ -130,6 +130,7 @@ def _of_result(result: Result, method: str | None, device: Any) -> _Page:
         depth=result.depth(method=chosen, device=device),
         method=chosen,
         truth=result.truth.depth,
+        sparse=smooth is None,
         reflectance=result.truth.reflectance,
         intensity=result.intensity * per_pulse,
         intensity_label="detections per pulse",
@@ -244,7 +245,7 @@ def _data(page: _Page) -> dict[str, Any]:
         "merged": merged,
         "edges": [round(1e9 * float(edge), 6) for edge in edges],
         "unit": page.unit,
-        "sparse": not any(layer["filled"] for layer in page.layers),
+        "sparse": page.sparse,
         "response": _response(page.response),
         "first": median_pixel(intensity, np.isfinite(depth) & np.isfinite(truth)),
     }
@@ -412,9 +413,7 @@ def _window(cube: NDArray[np.float64], edges: NDArray[np.float64], window_ns: tu
         first, last = (int(np.searchsorted(edges, time, side="right")) - 1 for time in window_ns)
         first, last = max(first, 0), min(max(last, 0), len(edges) - 2)
         if not window_ns[0] < window_ns[1] or window_ns[0] >= edges[-1] or window_ns[1] <= edges[0]:
-            raise ArgumentError(
-                f"window_ns = {window_ns} has no part of the gate, {edges[0]:.5g} to {edges[-1]:.5g} ns"
-            )
+            raise ArgumentError(f"window_ns = {window_ns} is not in the gate, {edges[0]:.5g} to {edges[-1]:.5g} ns")
         return slice(first, last + 1)
     filled = np.flatnonzero(cube.any(axis=(0, 1)))
     return slice(int(filled[0]), int(filled[-1]) + 1) if len(filled) else slice(0, cube.shape[2])

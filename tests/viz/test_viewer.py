@@ -201,7 +201,7 @@ def test_pictures_are_merged_and_windows_cut(result, frames, tmp_path):
     with Image.open(path) as images:
         assert images.n_frames == 5
     for wrong, message in (
-        ({"window_ns": (1.0, 2.0)}, "has no part of the gate"),
+        ({"window_ns": (1.0, 2.0)}, "is not in the gate"),
         ({"pictures": 0}, "pictures = 0"),
         ({"fps": 0}, "fps = 0"),
         ({"frame": 5}, r"frame = 5 is outside"),
