@@ -128,7 +128,7 @@ LINES = {
     "scene": (3700, 5204),
     "transport": (2300, 3478),
     "validate": (750, 794),
-    "viz": (2200, 2549),
+    "viz": (2200, 2548),
     "water": (800, 848),
     "kernels/spadwarp_kernels": (50, 50),
     "kernels/analytic": (1650, 1676),
