@@ -223,7 +223,7 @@ class HistogramNet(nn.Module):
             cells, images = self._seen(volumes, tops, counts, background, response)
         found, target = self._weighed(cells, images)
         with exact:
-            found = found[:, :, :height, :width].float().permute(4, 0, 2, 3, 1)
+            found = found[:, :, :height, :width].float().permute(4, 0, 2, 3, 1).contiguous()
             between = _interpolation(found.shape[-1], bins, found.device)
             score = found[-1] @ between
             for weight, volume in zip(F.softplus(found[:-1]), volumes, strict=True):
@@ -233,7 +233,7 @@ class HistogramNet(nn.Module):
     def _weighed(self, cells: Tensor, images: Tensor) -> tuple[Tensor, Tensor]:
         """Logarithms of weights, and the prior, of each cell `[B, N, H, W, n]`; the target's logit `[B, H, W]`."""
         image = self.enter_image(images).permute(0, 2, 3, 1)[:, None]
-        x = self.pyramid(self.enter(cells.permute(0, 4, 2, 3, 1)) + image)
+        x = self.pyramid(self.enter(cells.permute(0, 4, 2, 3, 1).contiguous()) + image)
         ends = x.amax(dim=1, keepdim=True), x.mean(dim=1, keepdim=True), images.permute(0, 2, 3, 1)[:, None]
         target = self.target_pyramid(self.enter_target(torch.cat(ends, dim=-1)))
         return self.head(x), self.target(target)[:, 0, ..., 0]

@@ -197,13 +197,16 @@ def detected(
 
     def summed(cube: NDArray[Any]) -> NDArray[Any]:  # over the pixels of a window that are in the frame
         for axis in (0, 1):
-            width = [(side // 2 + 1, side // 2) if one == axis else (0, 0) for one in range(3)]
-            before = np.moveaxis(np.cumsum(np.pad(cube, width), axis=axis), axis, 0)
-            cube = np.moveaxis(before[side:] - before[:-side], 0, axis)
+            total = cube.copy()
+            ahead, sums = np.moveaxis(cube, axis, 0), np.moveaxis(total, axis, 0)
+            for step in range(1, min(side // 2, len(sums) - 1) + 1):
+                sums[step:] += ahead[:-step]
+                sums[:-step] += ahead[step:]
+            cube = total
         return cube
 
     frames = counts.reshape(-1, *counts.shape[-3:])
-    known, height = np.broadcast_to(background, frames.shape[1:]), frames.shape[1]
+    known, height = np.asarray(background, np.float64), frames.shape[1]
     significance = np.empty(frames.shape[:-1], np.float32)
     options: dict[str, Any] = {"level_known": level_known, "device": "cpu"}
     half = np.flatnonzero(response >= 0.5 * np.max(response))
@@ -212,7 +215,11 @@ def detected(
     for top in range(0, height, _ROWS):
         first, stop = max(0, top - side // 2), top + _ROWS + side // 2
         inner = slice(top - first, top - first + _ROWS)
-        options["background"] = np.maximum(summed(known[first:stop].astype(np.float64))[inner], 0.0)
+        if known.ndim == 1:
+            pixels = summed(np.ones((*frames[0, first:stop].shape[:2], 1)))[inner]
+            options["background"] = np.maximum(pixels * known, 0.0)
+        else:
+            options["background"] = np.maximum(summed(known[first:stop])[inner], 0.0)
         for cube, image in zip(frames, significance, strict=True):
             some, out = summed(cube[first:stop].astype(np.int64))[inner], image[top : top + _ROWS]
             arrival_time(some, gate_start=0.0, bin_width=1e-12, significance=out, **options)
