@@ -285,7 +285,7 @@ class Run:
         is_cuda = self.side is not None
         with torch.autocast(self.device.type, dtype=torch.bfloat16, enabled=is_cuda, cache_enabled=False):
             output = self.network(*batch.inputs)
-        loss = histogram_loss(*output, batch) if self.counting else loss_of(output.float(), batch)
+        loss = histogram_loss(output[0], output[1], batch) if self.counting else loss_of(output.float(), batch)
         self.optimiser.zero_grad(set_to_none=True)
         loss.backward()
         nn.utils.clip_grad_norm_(self.network.parameters(), 1.0)
