@@ -448,16 +448,6 @@ def check_part(name: str, value: Any) -> tuple[int, int]:
     return number, parts
 
 
-def environment_integer(name: str, default: int) -> int:
-    """A variable of the environment that is an integer ≥ 0. Raises `ArgumentError` where it is none."""
-    text = os.environ.get(name)
-    if text is None:
-        return default
-    if not (text.isascii() and text.isdigit() and len(text) < 10):
-        raise ArgumentError(f"environment variable {name} = {shown(text)} is not an integer >= 0")
-    return int(text)
-
-
 def check_choice(name: str, value: Any, choices: Sequence[str]) -> str:
     """An argument that is one of some words. Raises `ArgumentError`, with the word that was probably meant."""
     if isinstance(value, str) and value in choices:

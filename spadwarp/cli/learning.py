@@ -13,7 +13,7 @@ from spadwarp.cli import options as opt
 from spadwarp.cli.app import complain, note, running, say, wrong
 from spadwarp.cli.options import command
 from spadwarp.cli.outputs import answer, check_outputs, progress, rows, show_table, write_json, written
-from spadwarp.values import count, environment_integer
+from spadwarp.values import count
 
 if TYPE_CHECKING:
     from spadwarp.evaluation import Evaluation, FreshScores, PhotonSweep, SceneScores
@@ -67,8 +67,7 @@ def train(recipe: Path, *, out: Path, overrides: list[str] | None = None, device
     """Train a denoiser on scenes that are drawn as it goes, or on the clean scenes of a dataset.
 
     New noise is drawn for each step. Writes weights (safetensors), log.jsonl, curves.png and a checkpoint, also at
-    Ctrl-C or SIGTERM; the same command resumes the training. Another recipe needs a new folder. On several GPUs:
-    torchrun --nproc-per-node N -m spadwarp train ...
+    Ctrl-C or SIGTERM; the same command resumes the training. Another recipe needs a new folder.
 
     Args:
         recipe (RECIPE): Training recipe (TOML), or the name of one of `spadwarp list training`.
@@ -81,15 +80,12 @@ def train(recipe: Path, *, out: Path, overrides: list[str] | None = None, device
       spadwarp train usdn --set data=data/small/ --set optimiser.steps=2000 --out runs/usdn/
     """
     chosen = spadwarp.denoise.load_training_recipe(recipe, overrides or ())
-    first = environment_integer("RANK", 0) == 0
     names = (f"{chosen.model}.safetensors", "log.jsonl", "curves.png", "checkpoint.pt")
-    check_outputs(out if first else None, names, inputs=(recipe,), resume=True)  # one process of torchrun writes
-    running.quiet |= not first
+    check_outputs(out, names, inputs=(recipe,), resume=True)
     trained = spadwarp.denoise.train(chosen, out, device=device, progress=progress("steps"), notify=note)
-    if first:
-        if trained.psnr < trained.input_psnr:
-            complain("the network makes frames worse than they are: train it for more steps", "warning")
-        answer({name: getattr(trained, name) for name in ("psnr", "input_psnr", "seconds", "weights")})
+    if trained.psnr < trained.input_psnr:
+        complain("the network makes frames worse than they are: train it for more steps", "warning")
+    answer({name: getattr(trained, name) for name in ("psnr", "input_psnr", "seconds", "weights")})
 
 
 _PICTURES = ("metrics", "samples", "rescaled", "detail", "ranking", "photons", "reliability")

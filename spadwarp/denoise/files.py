@@ -33,7 +33,7 @@ from spadwarp.io.paths import atomic_path, existing_file
 from spadwarp.result import Result
 from spadwarp.scene.sight import depth_from_time
 from spadwarp.transport import PhotonRecords
-from spadwarp.values import ArgumentError, FileError, check_real, environment_integer, percent, range_from_time
+from spadwarp.values import ArgumentError, FileError, check_real, percent, range_from_time
 from spadwarp.viz import draw_denoised, draw_learning_curves
 
 __all__ = ["denoise_file", "depth_files", "read_depth", "train"]
@@ -483,7 +483,7 @@ def train(
     Args:
         recipe: From `spadwarp.denoise.load_training_recipe`, or the recipe's path.
         out: The run's folder; new, or with an interrupted run of the same recipe.
-        device: torch device; default: the GPU of this process (torchrun gives one each), else the CPU.
+        device: torch device; default: the first GPU, else the CPU.
         progress: Called with ("steps", done, total) after every step.
         notify: Called with how long the training will take, once the first steps show it.
 
@@ -501,7 +501,7 @@ def train(
     if recipe.data is not None:
         training, validation = (read_scenes(recipe.data, split) for split in ("train", "validation"))
     trained = fit(recipe, training, validation, Path(out), device=device, progress=progress, notify=notify)
-    if environment_integer("RANK", 0) == 0 and trained.log.is_file() and trained.log.stat().st_size:
+    if trained.log.is_file() and trained.log.stat().st_size:
         log = [json.loads(line) for line in trained.log.read_text().splitlines()]
         draw_learning_curves(log, Path(out) / "curves.png", title=f"{recipe.model}, seed {recipe.seed}")
     return trained

@@ -9,7 +9,7 @@ how much the photons of others tell, where depth jumps, and what light is of no 
 
 from __future__ import annotations
 
-from functools import partial
+from functools import partial, reduce
 from itertools import pairwise
 from typing import Any
 
@@ -223,7 +223,7 @@ class HistogramNet(nn.Module):
             cells, images = self._seen(volumes, tops, counts, background, response)
         found, target = self._weighed(cells, images)
         with exact:
-            found = found[:, :, :height, :width].float().permute(4, 0, 2, 3, 1)
+            found = found[:, :, :height, :width].float().permute(4, 0, 2, 3, 1).contiguous()
             between = _interpolation(found.shape[-1], bins, found.device)
             score = found[-1] @ between
             for weight, volume in zip(F.softplus(found[:-1]), volumes, strict=True):
@@ -233,7 +233,7 @@ class HistogramNet(nn.Module):
     def _weighed(self, cells: Tensor, images: Tensor) -> tuple[Tensor, Tensor]:
         """Logarithms of weights, and the prior, of each cell `[B, N, H, W, n]`; the target's logit `[B, H, W]`."""
         image = self.enter_image(images).permute(0, 2, 3, 1)[:, None]
-        x = self.pyramid(self.enter(cells.permute(0, 4, 2, 3, 1)) + image)
+        x = self.pyramid(self.enter(cells.permute(0, 4, 2, 3, 1).contiguous()) + image)
         ends = x.amax(dim=1, keepdim=True), x.mean(dim=1, keepdim=True), images.permute(0, 2, 3, 1)[:, None]
         target = self.target_pyramid(self.enter_target(torch.cat(ends, dim=-1)))
         return self.head(x), self.target(target)[:, 0, ..., 0]
@@ -244,12 +244,12 @@ class HistogramNet(nn.Module):
         """Channels of cells `[B, n, H, W, N]` and of images `[B, n, H, W]`, filled up to whole strides."""
         missing = -counts.shape[-1] % (CELL * self.stride)
 
-        def in_cells(cube: Tensor, value: float) -> Tensor:
-            return F.pad(cube, (0, missing), value=value).unflatten(-1, (-1, CELL))
+        def in_cells(cube: Tensor, value: float) -> tuple[Tensor, ...]:
+            """The first bins of all cells, the second ones, …: faster on a CPU than to reduce four neighbours."""
+            return F.pad(cube, (0, missing), value=value).unflatten(-1, (-1, CELL)).unbind(dim=-1)
 
-        scores = [0.1 * in_cells(one.clamp_min(-_LEAST), -_LEAST).amax(dim=-1) for one in volumes]
-        above = in_cells(counts - background, 0.0).sum(dim=-1)
-        level = in_cells(background, 0.0).sum(dim=-1)
+        scores = [0.1 * reduce(torch.maximum, in_cells(one, -_LEAST)).clamp_min(-_LEAST) for one in volumes]
+        above, level = (reduce(torch.add, in_cells(one, 0.0)) for one in (counts - background, background))
         excess = 9.0 * pooled(above, 3) / (9.0 * level + 1.0).sqrt()
         profile = level.mean(dim=(1, 2), keepdim=True) + 1e-3
         profile = 0.25 * (profile / profile.mean(dim=-1, keepdim=True)).log()

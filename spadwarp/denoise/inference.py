@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import math
 import warnings
 from collections.abc import Callable
+from itertools import product
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple, get_args
 
@@ -195,13 +197,16 @@ def detected(
 
     def summed(cube: NDArray[Any]) -> NDArray[Any]:  # over the pixels of a window that are in the frame
         for axis in (0, 1):
-            width = [(side // 2 + 1, side // 2) if one == axis else (0, 0) for one in range(3)]
-            before = np.moveaxis(np.cumsum(np.pad(cube, width), axis=axis), axis, 0)
-            cube = np.moveaxis(before[side:] - before[:-side], 0, axis)
+            total = cube.copy()
+            ahead, sums = np.moveaxis(cube, axis, 0), np.moveaxis(total, axis, 0)
+            for step in range(1, min(side // 2, len(sums) - 1) + 1):
+                sums[step:] += ahead[:-step]
+                sums[:-step] += ahead[step:]
+            cube = total
         return cube
 
     frames = counts.reshape(-1, *counts.shape[-3:])
-    known, height = np.broadcast_to(background, frames.shape[1:]), frames.shape[1]
+    known, height = np.asarray(background, np.float64), frames.shape[1]
     significance = np.empty(frames.shape[:-1], np.float32)
     options: dict[str, Any] = {"level_known": level_known, "device": "cpu"}
     half = np.flatnonzero(response >= 0.5 * np.max(response))
@@ -210,7 +215,11 @@ def detected(
     for top in range(0, height, _ROWS):
         first, stop = max(0, top - side // 2), top + _ROWS + side // 2
         inner = slice(top - first, top - first + _ROWS)
-        options["background"] = np.maximum(summed(known[first:stop].astype(np.float64))[inner], 0.0)
+        if known.ndim == 1:
+            pixels = summed(np.ones((*frames[0, first:stop].shape[:2], 1)))[inner]
+            options["background"] = np.maximum(pixels * known, 0.0)
+        else:
+            options["background"] = np.maximum(summed(known[first:stop])[inner], 0.0)
         for cube, image in zip(frames, significance, strict=True):
             some, out = summed(cube[first:stop].astype(np.int64))[inner], image[top : top + _ROWS]
             arrival_time(some, gate_start=0.0, bin_width=1e-12, significance=out, **options)
@@ -257,7 +266,17 @@ def estimate_histograms(
     return within_bins(Estimate(*(image.reshape(depth.shape) for image in found)))
 
 
-_TILE, _MARGIN = 128, 32  # pixels of a large frame that are computed at once, and those around them that are seen
+_MARGIN = 32  # pixels around a part of a large frame that are seen, too
+_AT_ONCE = 5 << 20  # bins of all pixels that are computed at once: little memory
+_LEAST_PART = 96  # pixels of a side: smaller parts would see more of others than of their own
+
+
+def _parts(length: int, most: int) -> list[tuple[slice, slice]]:
+    """A side in equal parts of at most so many pixels: what is answered, and what is seen for it."""
+    count = -(-length // most)
+    step = -(-length // (16 * count)) * 16  # whole strides of the network
+    firsts = range(0, length, step)
+    return [(slice(one, one + step), slice(max(0, one - _MARGIN), one + step + _MARGIN)) for one in firsts]
 
 
 def _by_network(
@@ -267,27 +286,28 @@ def _by_network(
     torch = require_torch()
     from spadwarp.denoise.histogram_network import answer, rebinned
 
-    bins, answers = counts.shape[-1], []
-    network = load_network("histograms", weights, str(torch_device(device)))
+    frames = counts.reshape(-1, *counts.shape[-3:])
+    height, width, bins = frames.shape[1:]
+    found = np.empty((3, *frames.shape[:3]), np.float32)
+    network, merged = load_network("histograms", weights, str(torch_device(device))), merged_bins(bins, response)
+    most = max(_LEAST_PART, math.isqrt(_AT_ONCE * merged // bins) - 2 * _MARGIN)
     with torch.inference_mode():
-        for cube, level, taps in histogram_tensors(counts, background, response, device):
-            if (merged := merged_bins(bins, response)) > 1:
-                cube, level, taps = rebinned(cube, level, taps, merged)
-            height, width = cube.shape[1:3]
-            found = torch.empty(3, height, width)
-            for top, left in ((y, x) for y in range(0, height, _TILE) for x in range(0, width, _TILE)):
-                first = max(0, top - _MARGIN), max(0, left - _MARGIN)
-                part = (slice(None), *(slice(one, one + _TILE + 2 * _MARGIN) for one in first))
-                own = level[part] if level.shape[1] > 1 else level
-                probability, target = network(cube[part], own, taps)
-                tile = torch.stack([*answer(probability), target.sigmoid()])[:, 0].cpu()
-                rows, columns = (slice(at - one, at - one + _TILE) for at, one in zip((top, left), first, strict=True))
-                found[:, top : top + _TILE, left : left + _TILE] = tile[:, rows, columns]
-            found[0] *= merged * cube.shape[-1] / bins  # the last of merged bins may reach beyond the gate
-            found[0] += 0.5 * (merged % 2 == 0) / bins  # an even number has no middle: the response is that of the next
-            answers.append(found)
-    depth, confidence, target = torch.stack(answers, dim=1).numpy()
-    return np.stack([depth, target, confidence])
+        for (rows, seen_rows), (columns, seen_columns) in product(_parts(height, most), _parts(width, most)):
+            part = np.s_[..., seen_rows, seen_columns, :]
+            level = background[part] if background.ndim == 3 else background
+            given = histogram_tensors(frames[part], level, response, device)
+            sides = (rows, seen_rows), (columns, seen_columns)
+            inner = tuple(slice(one.start - seen.start, one.stop - seen.start) for one, seen in sides)
+            for image, (cube, known, taps) in zip(found.swapaxes(0, 1), given, strict=True):
+                if merged > 1:
+                    cube, known, taps = rebinned(cube, known, taps, merged)
+                probability, target = network(cube, known, taps)
+                depth, confidence = answer(probability)
+                depth *= merged * cube.shape[-1] / bins  # the last of merged bins may reach beyond the gate
+                depth += 0.5 * (merged % 2 == 0) / bins  # an even number has no middle: the response is the next's
+                answers = torch.cat([depth, target.sigmoid(), confidence])
+                image[:, rows, columns] = answers[:, *inner].cpu().numpy()
+    return found
 
 
 def _leaves_frames_empty(depth: NDArray[Any], gate: tuple[float, float], part: tuple[float, float]) -> bool:
@@ -347,9 +367,6 @@ def estimate_frames(
         inputs = frames.network_input()
     begin, extent = frames.gate[0], frames.gate[1] - frames.gate[0]
     part = max(1, _PIXELS_AT_ONCE[place.type] // frames.depth[0].size)
-    # glibc returns memory to the system after each frame, and fresh pages take as long as half the network, unless a
-    # block this large (at most 32 MiB) was freed before: M_TRIM_THRESHOLD in mallopt(3).
-    torch.empty(31 << 20, dtype=torch.uint8)
     answers, finite = torch.empty(3, *frames.depth.shape), True
     for first in range(0, len(frames.depth), part):
         some = slice(first, first + part)

@@ -226,8 +226,3 @@ class SymmetricWindow(nn.Module):
     def forward(self, x: Tensor) -> Tensor:
         weight, bias = self.filters()
         return F.conv2d(x, weight[:, :, None, None].contiguous(), bias)
-
-
-def symmetric_mean(x: Tensor) -> Tensor:
-    """Mean of each feature over its eight channels: scalars that turn with the image."""
-    return x.unflatten(1, (-1, GROUP)).mean(dim=2)

@@ -60,6 +60,9 @@ def load_network(
             raise ValueError(f"{wrong[0]} is not finite")
     except Exception as error:  # safetensors and torch have errors of their own
         raise FileError(f"{path}: not weights of {model!r}: {error}") from error
+    # glibc returns memory to the system after each layer, and fresh pages take as long as the layer, unless a block
+    # this large (at most 32 MiB) was freed before: M_TRIM_THRESHOLD in mallopt(3).
+    torch.empty(31 << 20, dtype=torch.uint8)
     network = network.to(torch.device(device), getattr(torch, precision))
     if model != "histograms":
         network = network.to(memory_format=torch.channels_last)

@@ -114,11 +114,6 @@ class Optimiser(Section):
     warm_up: Whole = Field(500, ge=0, le=10**12, description="updates in which the learning rate rises")
     weight_decay: float = Field(1e-4, ge=0, le=1e3)
     averaging: float = Field(0.999, ge=0, lt=1, description="decay of the running mean of the weights that is kept")
-    loss: Literal["psnr", "mse"] = Field(
-        "psnr",
-        description='"psnr": logarithm of the mean square of each crop, so that easy crops count as much as hard ones',
-    )
-    precision: Literal["bfloat16", "float32"] = Field("bfloat16", description="of the network's layers on a GPU")
     report_every: Whole | None = Field(
         None, ge=1, le=10**12, description="updates between two lines of the log; default: steps / 20, at most 500"
     )

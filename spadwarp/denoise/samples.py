@@ -19,61 +19,45 @@ from spadwarp.denoise.synthetic_noise import (
 _WATER = (0.03, 0.85)  # part of a scene that is target, where it counts as a target in open water
 
 
-class Scenes:
-    """The clean scenes of each step: those `given`, of a dataset, or new ones that each process draws for itself.
-
-    `crop`: side of the crops that are cut from them [pixels]; default: the recipe's.
-    """
-
-    def __init__(
-        self,
-        recipe: TrainingRecipe,
-        rank: int,
-        device: torch.device,
-        given: CleanScenes | None,
-        crop: int | None = None,
-    ) -> None:
-        self.recipe, self.rank, self.device = recipe, rank, device
-        self.crop = recipe.optimiser.crop if crop is None else crop
-        self.given = None if given is None else given.to(device)
-        self.finer = SUBPIXELS if given is None and recipe.model == "histograms" else 1
-        self.drawn: tuple[int, CleanScenes] | None = None
-
-    def at(self, step: int) -> CleanScenes:
-        """Scenes for a step, which do not depend on the steps before it."""
-        if self.given is not None:
-            return self.given
-        settings = self.recipe.optimiser
-        turn = step // settings.redraw
-        if self.drawn is None or self.drawn[0] != turn:
-            seed = (self.recipe.seed * 1_000_003 + turn) * 4096 + self.rank
-            scenes = procedural_scenes(
-                settings.scenes, self.crop + 32, seed=seed % 2**62, device=self.device, finer=self.finer
-            )
-            self.drawn = turn, scenes
-        return self.drawn[1]
-
-
 class Samples:
     """Batches of `size` crops, drawn anew in each step; those of histograms of one part of the mixture, and its bins.
 
-    `prepare` is called before each step; `batch` may then be recorded in a CUDA graph, for steps of the same `kind`.
+    They are cut from scenes `given`, of a dataset, or from new ones, which do not depend on the steps before. `prepare`
+    is called before each step; `batch` may then be recorded in a CUDA graph, for steps of the same `kind`.
     """
 
     def __init__(
-        self, recipe: TrainingRecipe, scenes: Scenes, size: int, generator: torch.Generator, *, histograms: bool
+        self, recipe: TrainingRecipe, given: CleanScenes | None, crop: int, size: int, generator: torch.Generator
     ) -> None:
-        self.recipe, self.scenes, self.size = recipe, scenes, size
-        self.generator, self.histograms = generator, histograms
+        self.recipe, self.crop, self.size, self.generator = recipe, crop, size, generator
+        self.histograms = recipe.model == "histograms"
+        self.given = None if given is None else given.to(generator.device)
+        self.finer = SUBPIXELS if given is None and self.histograms else 1
+        self.drawn: tuple[int, CleanScenes] | None = None
         self.parts = recipe.parts()
         self.part, self.bins = self.parts[0], COUNT_BINS[0]
         self.now: CleanScenes | None = None
         self.held: CleanScenes | None = None
 
+    def _scenes(self, step: int) -> CleanScenes:
+        if self.given is not None:
+            return self.given
+        settings = self.recipe.optimiser
+        turn = step // settings.redraw
+        if self.drawn is None or self.drawn[0] != turn:
+            seed = (self.recipe.seed * 1_000_003 + turn) * 4096 % 2**62
+            self.drawn = (
+                turn,
+                procedural_scenes(
+                    settings.scenes, self.crop + 32, seed=seed, device=self.generator.device, finer=self.finer
+                ),
+            )
+        return self.drawn[1]
+
     def prepare(self, step: int) -> None:
-        now = self.scenes.at(step)
+        now = self._scenes(step)
         if self.histograms:
-            host = np.random.default_rng((self.recipe.seed, self.scenes.rank, step))
+            host = np.random.default_rng((self.recipe.seed, 0, step))
             self.part = self.parts[host.choice(len(self.parts), p=[part.share for part in self.parts])]
             often = 1.0 / np.array(COUNT_BINS)  # many bins take as much more time
             self.bins = int(host.choice(COUNT_BINS, p=often / often.sum()))
@@ -89,7 +73,7 @@ class Samples:
     @property
     def kind(self) -> tuple[int, Part, int]:
         """What the operations of a step depend on."""
-        return self.scenes.crop, self.part, self.bins
+        return self.crop, self.part, self.bins
 
     def hold(self) -> None:
         """From now on `batch` reads the same memory in every step."""
@@ -100,8 +84,8 @@ class Samples:
         scenes = self.held or self.now
         assert scenes is not None
         return draw_batch(
-            scenes, self.part, size=self.size, crop=self.scenes.crop, generator=self.generator,
-            histograms=self.histograms, bins=self.bins, finer=self.scenes.finer,
+            scenes, self.part, size=self.size, crop=self.crop, generator=self.generator,
+            histograms=self.histograms, bins=self.bins, finer=self.finer,
         )  # fmt: skip
 
 
@@ -112,20 +96,16 @@ class Sizes:
     small crops alone, the network would never see a pixel far from the border of its image.
     """
 
-    def __init__(
-        self, recipe: TrainingRecipe, rank: int, processes: int, generator: torch.Generator,
-        given: CleanScenes | None, *, histograms: bool,
-    ) -> None:  # fmt: skip
+    def __init__(self, recipe: TrainingRecipe, generator: torch.Generator, given: CleanScenes | None) -> None:
         settings = recipe.optimiser
         self.recipe, self.kinds = recipe, list[Samples]()
         for turns, scale in ((1.0 - settings.wide, 1), (settings.wide, 2)):
             if turns > 0.0:
-                scenes = Scenes(recipe, rank, generator.device, given, scale * settings.crop)
-                size = max(1, settings.batch // processes // scale**2)
-                self.kinds.append(Samples(recipe, scenes, size, generator, histograms=histograms))
+                size = max(1, settings.batch // scale**2)
+                self.kinds.append(Samples(recipe, given, scale * settings.crop, size, generator))
 
     def of(self, step: int) -> Samples:
-        """Those of which the step takes a batch; the same in every process."""
+        """Those of which the step takes a batch."""
         if len(self.kinds) == 1:
             return self.kinds[0]
         return self.kinds[int(np.random.default_rng((self.recipe.seed, step)).random() < self.recipe.optimiser.wide)]

@@ -555,7 +555,7 @@ class _Response(NamedTuple):
 
 
 def _draw_response(random: Random) -> _Response:
-    width, ratio = random.log_between((0.6, 3.6), 1), random.log_between((1.0, 3.0), 1)
+    width, ratio = random.log_between((0.6, 5.0), 1), random.log_between((1.0, 3.0), 1)
     ratio = torch.where(random.coin(0.5, 1), 1.0, torch.where(random.coin(0.8, 1), ratio, 1.0 / ratio))
     wide = 0.3 * random.uniform(1) * random.coin(0.3, 1)
     tail = random.between((0.05, 0.8), 1) * random.coin(0.4, 1)

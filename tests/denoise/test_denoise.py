@@ -3,29 +3,20 @@
 import dataclasses
 import json
 import re
-import subprocess
-import sys
-import time
 
 import numpy as np
 import pytest
-import torch
 from skimage.metrics import structural_similarity
 
 import spadwarp
-from helpers.cli import ENVIRONMENT, run
+from helpers.cli import run
 from helpers.datasets import make, recipe
 from helpers.scenes import scene as make_scene
 from helpers.stepped_frames import GATE, noisy_frame, scene
 from spadwarp import ArgumentError, FileError
 from spadwarp.dataset import Plan
-from spadwarp.denoise import baselines, files, network_files, samples, training
-from spadwarp.denoise.files import read_scenes
+from spadwarp.denoise import baselines, files, network_files
 from spadwarp.denoise.frames import depth_frames, fill_missing
-from spadwarp.denoise.networks import build_network
-from spadwarp.denoise.recipe import load_training_recipe
-from spadwarp.denoise.synthetic_noise import Batch
-from spadwarp.denoise.training import fit
 from spadwarp.evaluation import datasets, photon_counts
 from spadwarp.frames import record_frames
 
@@ -150,58 +141,6 @@ def test_training_from_a_dataset(dataset, tmp_path):
     assert found.methods == ("input", "usdn", "own") and str(own) in found.summary
     assert found.mean("own").psnr < found.mean("usdn").psnr  # two steps against a whole training
     assert json.loads((out / "log.jsonl").read_text().splitlines()[-1])["input_psnr"] > 10
-
-
-@pytest.mark.slow
-def test_two_processes_train_as_one_and_resume_after_a_kill(dataset, tmp_path, monkeypatch):
-    """torchrun, stopped in the middle and started again, against one process that takes both halves of each batch.
-
-    They add up the same gradients in another order. Weights agree to a thousandth of their change, since Adam and the
-    maxima in the network enlarge differences of rounding; half the batch alone would change them in another way.
-    """
-    place, out = tmp_path / "recipe.toml", tmp_path / "two"
-    optimiser = "steps = 16\nbatch = 4\ncrop = 32\nreport_every = 4\nwarm_up = 2\naveraging = 0.5"
-    place.write_text(f'model = "usdn"\ndata = "{dataset}"\nseed = 3\nnoise.counting = 0.0\n[optimiser]\n{optimiser}\n')
-    command = [sys.executable, "-m", "torch.distributed.run", "--standalone", "--nproc-per-node", "2"]
-    command += ["-m", "spadwarp", "train", str(place), "--out", str(out), "--device", "cpu"]
-    options = {"env": {**ENVIRONMENT, "OMP_NUM_THREADS": "1"}, "text": True}
-    with subprocess.Popen(command, stdout=subprocess.DEVNULL, stderr=subprocess.PIPE, **options) as first:
-        while first.poll() is None and not (out / "checkpoint.pt").is_file():
-            time.sleep(0.02)
-        first.terminate()
-        errors = first.communicate(timeout=240)[1]
-    assert (out / "checkpoint.pt").is_file(), errors
-    assert not (out / "usdn.safetensors").exists()
-    with (out / "log.jsonl").open("a") as file:
-        file.write('{"step": 1')  # of a kill between a line and its checkpoint
-    again = subprocess.run(command, capture_output=True, timeout=240, **options)
-    assert again.returncode == 0, again.stderr
-    assert again.stdout.count("weights") == 1 and "strides" not in again.stderr
-    visible = {path.name for path in out.glob("[!.]*")}  # hidden: what was half written
-    assert visible == {"checkpoint.pt", "curves.png", "log.jsonl", "usdn.safetensors"}
-    steps = [json.loads(line)["step"] for line in (out / "log.jsonl").read_text().splitlines()]
-    assert steps == [4, 8, 12, 16]
-
-    streams = [torch.Generator().manual_seed(3 * 1009 + rank) for rank in range(2)]
-    draw, loss = samples.draw_batch, training.loss_of
-
-    def both(scenes, noise, *, size, generator, **others):
-        halves = [draw(scenes, noise, size=size // 2, generator=one, **others) for one in streams]
-        return Batch(*map(torch.cat, zip(*halves, strict=True)))
-
-    def mean_loss(output, batch, *, kind):
-        halves = zip(*(one.chunk(2) for one in (output, *batch)), strict=True)
-        return sum(loss(one, Batch(*parts), kind=kind) for one, *parts in halves) / 2
-
-    monkeypatch.setattr(samples, "draw_batch", both)
-    monkeypatch.setattr(training, "loss_of", mean_loss)
-    scenes = [read_scenes(dataset, split) for split in ("train", "validation")]
-    fit(load_training_recipe(place), *scenes, tmp_path / "one", device="cpu")
-    torch.manual_seed(3)
-    checkpoints = [torch.load(folder / "checkpoint.pt")["network"] for folder in (out, tmp_path / "one")]
-    states = [build_network("usdn").state_dict(), *checkpoints]
-    new, two, one = (torch.cat([values.flatten() for values in state.values()]) for state in states)
-    assert (one - two).norm() < 1e-3 * (one - new).norm()
 
 
 # Few photons

@@ -82,7 +82,8 @@ def test_large_frames_are_computed_in_parts(monkeypatch):
     """Beyond the reach of the weights a pixel has the same depth in a part as in the whole."""
     counts, level = histograms(np.linspace(40.0, 80.0, 96) + np.zeros((96, 1)), 30.0, 5.0, side=96)
     whole = found_in(counts, level).depth
-    monkeypatch.setattr(inference, "_TILE", 48)
+    monkeypatch.setattr(inference, "_LEAST_PART", 48)
+    monkeypatch.setattr(inference, "_AT_ONCE", 1)
     assert np.quantile(np.abs(found_in(counts, level).depth - whole), 0.99) < 0.05
 
 

@@ -45,7 +45,7 @@ def drawn(monkeypatch):
 
 
 def batches(steps, **changes):
-    ours = Sizes(recipe(**changes), 0, 1, torch.Generator().manual_seed(1), None, histograms=True)
+    ours = Sizes(recipe(**changes), torch.Generator().manual_seed(1), None)
     for step in range(steps):
         ours.of(step).prepare(step)
         ours.of(step).batch()

@@ -49,7 +49,6 @@ LEFT_OUT = {
     r"^spadwarp doctor": "reports on this machine; tests/doctor",
     r"--ray |out/cluster/": "needs a Ray cluster; tests/parallel runs Ray on this machine",
     r"^sbatch|part\$id|out/part": "needs Slurm; tests/transport runs and merges shards",
-    r"^torchrun": "needs several GPUs",
     r"train configs/|\bruns/": "recipes for a GPU; tests/denoise trains the networks for a few steps",
     r"^python bench/peers": "needs networks of others",
     r"^python docs/figures/measured": "needs a published capture",
