@@ -110,11 +110,11 @@ def test_one_line_methods_have_one_line():
 # Lines of `*.py`: what a package is to come to, and what it has. What it has may only fall; a feature that needs more
 # lines deletes as many, or brings its own with a reason.
 LINES = {
-    "spadwarp": (750, 1443),
+    "spadwarp": (750, 1433),
     "analytic": (2000, 2515),
     "benchmark": (500, 505),
     "checks": (800, 900),
-    "cli": (2900, 3079),
+    "cli": (2900, 3075),
     "dataset": (2600, 2669),
     "denoise": (4300, 4609),
     "evaluation": (1600, 1598),
