@@ -299,7 +299,7 @@ def _make_block_fly(kinds: int, beside: Rider) -> wp.Function:
     def fly(c: CarriedRef, world: WorldRef, x: wp.vec3, u: wp.vec3, length: float):
         beside.fly(c, world, x, u, length)
         blocks = world.derivatives.blocks
-        line = grid_line(blocks.grid, x, u, length)
+        line = grid_line(blocks.grid, blocks.grid.size, 1, x, u, length)
         if line.begin < line.end:
             place = first_place(line, blocks.grid.size)
             while place.leave < line.end:
