@@ -17,7 +17,7 @@ from spadwarp_kernels.surface.ray_cast import SurfaceHit
 from spadwarp_kernels.tally import ledger
 from spadwarp_kernels.tally.flux import Flux
 from spadwarp_kernels.tally.ledger import add_to_ledger, to_ledger
-from spadwarp_kernels.tally.tally import BACKSCATTER, add_pending, add_to_words, atomic_add_int64, tally_components
+from spadwarp_kernels.tally.tally import BACKSCATTER, add_pending, atomic_add_int64, tally_components
 from spadwarp_kernels.water.limits import Limits
 from spadwarp_kernels.water.medium import Layers, Lines, Medium
 from spadwarp_kernels.water.phase_functions import Guiding
@@ -348,10 +348,10 @@ def _make_deposit_unsigned(count: int) -> wp.Function:
             book(account, sink, wp.where(exact > DEPOSIT_LIMIT, ledger.CLIPPED, ledger.INVALID), wp.int64(1))
         elif c.index >= 0:
             if exact >= 1.0:
-                account.pending = add_pending(sink.tally, account.pending, c.index, units)
+                account.pending = add_pending(sink.tally, sink.low, account.pending, c.index, units)
             else:
                 if units > wp.int64(0):
-                    account.pending = add_pending(sink.tally, account.pending, c.index, units)
+                    account.pending = add_pending(sink.tally, sink.low, account.pending, c.index, units)
                 voxels = sink.tally.shape[0] // wp.static(count)
                 component = wp.where(c.index >= voxels, 1, 0) + wp.where(c.index - voxels >= voxels, 1, 0)
                 entry = ledger.BELOW_UNIT + component
@@ -378,11 +378,10 @@ def _deposit_signed(account: AccountRef, sink: SinkRef, index: int, units: float
 
 
 @memoised
-def make_deposit(signed: int, kinds: int, split: bool, sea: bool = False, lines: bool = False) -> wp.Function:
+def make_deposit(signed: int, kinds: int, sea: bool = False, lines: bool = False) -> wp.Function:
     """The Warp function ``(account, sink, world, contribution)`` that adds a contribution to the tally, with so many
-    parameters or channels that have signs and so many kinds of derivatives by block; `split`: the low words of the
-    tally are apart; `sea`: the tally has a component of light that met the surface of the sea alone; `lines`:
-    the channels are lines with delays of their own."""
+    parameters or channels that have signs and so many kinds of derivatives by block; `sea`: the tally has a component
+    of light that met the surface of the sea alone; `lines`: the channels are lines with delays of their own."""
     deposit_unsigned = _make_deposit_unsigned(len(tally_components(sea)))
 
     @wp.func
@@ -406,11 +405,6 @@ def make_deposit(signed: int, kinds: int, split: bool, sea: bool = False, lines:
                             units = c.value * blocks.memory[score_entry(blocks, 1, q, k)] * blocks.scale[q]
                             p = wp.static(signed) + q * blocks.count + k
                             _deposit_signed(account, sink, c.index * width + p, units, c.rounding_sample)
-        if wp.static(split):
-            units = c.value * sink.scale
-            if c.index >= 0 and units >= 1.0 and units <= DEPOSIT_LIMIT:
-                add_to_words(sink.tally, sink.low, c.index, to_fixed_point(units, c.rounding_sample))
-                return
         deposit_unsigned(account, sink, c)
 
     return deposit

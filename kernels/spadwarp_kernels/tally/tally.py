@@ -45,7 +45,16 @@ def atomic_add_int64(tally: wp.array[wp.int64], index: int, value: wp.int64):
 
 @wp.func_native("""
 #if defined(__CUDA_ARCH__)
-    atomicAdd(reinterpret_cast<unsigned long long*>(tally.data) + index, static_cast<unsigned long long>(value));
+    unsigned long long* voxel = reinterpret_cast<unsigned long long*>(tally.data) + index;
+    if (low.shape.dims[0] > 0) {
+        const unsigned part = static_cast<unsigned>(value);
+        const unsigned before = atomicAdd(reinterpret_cast<unsigned*>(low.data) + index, part);
+        const unsigned high = static_cast<unsigned>(value >> 32) + (before + part < part ? 1u : 0u);
+        // 32 bits are enough: a carry out of the high half is lost in an addition of 64 bits, too.
+        if (high) atomicAdd(reinterpret_cast<unsigned*>(voxel) + 1, high);
+    } else {
+        atomicAdd(voxel, static_cast<unsigned long long>(value));
+    }
     return pending;
 #else
     long long* voxels = reinterpret_cast<long long*>(tally.data);
@@ -54,9 +63,12 @@ def atomic_add_int64(tally: wp.array[wp.int64], index: int, value: wp.int64):
     return wp::vec2l(index, value);
 #endif
 """)
-def add_pending(tally: wp.array[wp.int64], pending: wp.vec2l, index: int, value: wp.int64) -> wp.vec2l:
-    """`atomic_add_int64`, on the CPU one call later: a core stands still while a voxel comes from memory, so the
-    (index, value) that the call before returned is added now, and the memory of this one is requested."""
+def add_pending(
+    tally: wp.array[wp.int64], low: wp.array[wp.uint32], pending: wp.vec2l, index: int, value: wp.int64
+) -> wp.vec2l:
+    """`atomic_add_int64` of value >= 0; on CUDA the low words of the voxels may be apart, else `low` is empty. On the
+    CPU one call later: a core stands still while a voxel comes from memory, so the (index, value) that the call before
+    returned is added now, and the memory of this one is requested."""
     ...
 
 
@@ -129,21 +141,6 @@ PHOTONS_PER_VOXEL = 4
 def splitting_pays(voxels: int, photon_count: int) -> bool:
     """Whether low words make a launch of so many photons faster, with so many voxels in a component of the tally."""
     return 8 * voxels > CACHE_BYTES and photon_count >= PHOTONS_PER_VOXEL * voxels
-
-
-@wp.func_native("""
-#if defined(__CUDA_ARCH__)
-    const unsigned low = static_cast<unsigned>(value);
-    const unsigned before = atomicAdd(reinterpret_cast<unsigned*>(split_accumulators.data) + index, low);
-    const unsigned high = static_cast<unsigned>(value >> 32) + (before + low < low ? 1u : 0u);
-    // 32 bits are enough: a carry out of the high half is lost in an addition of 64 bits, too.
-    if (high)
-        atomicAdd(reinterpret_cast<unsigned*>(reinterpret_cast<long long*>(tally.data) + index) + 1, high);
-#endif
-""")
-def add_to_words(tally: wp.array[wp.int64], split_accumulators: wp.array[wp.uint32], index: int, value: wp.int64):
-    """Adds value >= 0 to a voxel whose low word is apart; on CUDA alone."""
-    ...
 
 
 @wp.kernel

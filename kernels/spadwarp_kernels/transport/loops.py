@@ -22,11 +22,10 @@ __all__ = ["make_transport_kernel"]
 
 
 @memoised
-def make_transport_kernel(spec: TransportSpec, cuda: bool = False, split_accumulators: bool = False) -> wp.Kernel:
+def make_transport_kernel(spec: TransportSpec, cuda: bool = False) -> wp.Kernel:
     """The transport kernel for a spec; launch grid: any number of threads, which share the photons among them.
 
-    On CUDA they must be a multiple of the block size, since whole warps vote. `split_accumulators`: on CUDA, the low
-    words of the tally are apart, see `tally.splitting_pays`.
+    On CUDA they must be a multiple of the block size, since whole warps vote.
 
     Raises:
         ArgumentError: An estimator that is not one of ESTIMATORS, or confocal with the plain lens.
@@ -34,7 +33,7 @@ def make_transport_kernel(spec: TransportSpec, cuda: bool = False, split_accumul
     check_spec(spec)
     if not cuda and spec != spec.on_cpu:
         return make_transport_kernel(spec.on_cpu)
-    stages = compose(spec, cuda, split_accumulators)
+    stages = compose(spec, cuda)
     options = {
         "module": "unique",
         "module_options": {"fast_math": cuda},
