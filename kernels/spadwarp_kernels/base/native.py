@@ -18,6 +18,18 @@ def from_bits(bits: int) -> float:
     return wp.cast(bits, float)
 
 
+@wp.func_native("""
+#if defined(__CUDA_ARCH__)
+    return __uint_as_float(__float_as_uint(x) ^ (__float_as_uint(sign) & 0x80000000u));
+#else
+    return __builtin_signbit(sign) ? -x : x;
+#endif
+""")
+def times_sign(x: float, sign: float) -> float:
+    """x, negated where the sign bit is set, also of a zero."""
+    ...
+
+
 # ---- Memory that is read and written all over.
 
 
@@ -52,6 +64,19 @@ def load_float(values: wp.array[float], index: int) -> float:
 """)
 def load_vec2(values: wp.array[wp.vec2], index: int) -> wp.vec2:
     """As `load_float`, by one instruction instead of two; the array begins at a multiple of 8 bytes."""
+    ...
+
+
+@wp.func_native("""
+#if defined(__CUDA_ARCH__)
+    const float4 v = __ldg(reinterpret_cast<const float4*>(rows.data) + static_cast<int64_t>(row));
+    return wp::vec4(v.x, v.y, v.z, v.w);
+#else
+    return rows.data[row];
+#endif
+""")
+def load_row(rows: wp.array[wp.vec4], row: int) -> wp.vec4:
+    """An entry of a contiguous array that no kernel changes, in one load on CUDA."""
     ...
 
 

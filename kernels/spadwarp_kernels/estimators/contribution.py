@@ -7,8 +7,9 @@ from spadwarp_kernels.base.native import from_bits
 from spadwarp_kernels.base.philox import join_words, u01, u01_fine, u01_high, u01_low
 from spadwarp_kernels.base.rotations import cotangent, one_minus_cosine, snap_from
 from spadwarp_kernels.optics.camera import lens_point
+from spadwarp_kernels.optics.port import Connection
 from spadwarp_kernels.optics.sea import FACETS, passage_density
-from spadwarp_kernels.optics.visibility import Link, lens_in_air
+from spadwarp_kernels.optics.visibility import lens_in_air
 from spadwarp_kernels.photon.queue import Request
 from spadwarp_kernels.photon.spec import TransportSpec
 from spadwarp_kernels.photon.state import SEA_FACE, SEA_SLOT, Contribution, PhotonState, World
@@ -376,7 +377,7 @@ def _make_carry(spec: TransportSpec) -> wp.Function:
     pose, sea, rider = spec.sight.pose, spec.sight.sea is not None, make_rider(spec)
 
     @wp.func
-    def carry(found: wp.ref[Scored], request: Request, link: Link, world: wp.ref[World], inside: wp.vec3):
+    def carry(found: wp.ref[Scored], request: Request, link: Connection, world: wp.ref[World], inside: wp.vec3):
         carried = request.carried
         rider.fork(carried, world)
         to_lens = pose.turn_out(world.scan, request.target, link.to_lens)
@@ -391,7 +392,7 @@ def _make_carry(spec: TransportSpec) -> wp.Function:
             rider.fly(carried, world, begin, pose.turn_out(world.scan, request.target, link.along), link.water)
         else:
             rider.fly(carried, world, found.origin, to_lens, link.water)
-        rider.deliver(found.contribution, carried, world, link.end, link.to_lens, arrives)
+        rider.deliver(found.contribution, carried, world, link.exit, link.to_lens, arrives)
 
     return carry
 
@@ -438,7 +439,7 @@ def make_score(spec: TransportSpec, flights: bool = False) -> wp.Function:
         surface = sight.sea_at(world.sea, world.scan, request.target)
         link = sight.link(camera, surface, origin, lens, at_sea, bits)
         to_lens = pose.turn_out(world.scan, request.target, link.to_lens)
-        found.lens = pose.point_out(world.scan, request.target, link.end)
+        found.lens = pose.point_out(world.scan, request.target, link.exit)
         found.behind = pose.point_out(world.scan, request.target, lens)
         pixel = sight.project(world.camera, view, request.target, link.image, lens)
         scattering = scattering_density(request, found.origin, to_lens, world)

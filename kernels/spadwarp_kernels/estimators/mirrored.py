@@ -131,7 +131,7 @@ def _make_score_image(spec: TransportSpec) -> wp.Function:
         if wp.static(followed):
             seed = join_words(request.first, wp.uint32(number + 1) << wp.uint32(8))
             follow(
-                found, request, x, heading, link.water, reflections_of(image), link.end, lens - link.image, world, seed
+                found, request, x, heading, link.water, reflections_of(image), link.exit, lens - link.image, world, seed
             )
         if wp.static(measured):
             extinction = found.depth / link.water

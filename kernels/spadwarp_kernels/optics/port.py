@@ -46,17 +46,22 @@ class Port:
 
 @wp.struct
 class Connection:
-    """The one way of light from a point in the water to a point inside."""
+    """The one way of light from a point in the water to a point inside, or to one of the lens."""
 
-    to_port: wp.vec3  # unit direction in the water
+    to_lens: wp.vec3  # unit direction at the point
     inside: wp.vec3  # unit direction in which it arrives
-    exit: wp.vec3  # where it leaves the water [m]
+    exit: wp.vec3  # where it leaves the water, or crosses the surface of a sea; else the point of the lens [m]
     water: float  # length of its way in the water [m]
     path: float  # length in water that takes as long as the whole way [m]
     transmission: float  # fraction of unpolarised light that gets through
     # solid angle at the point in the water over the area that its light covers inside, across the ray [sr/m^2]; 0:
     # there is no such way. 1/r^2 where all indices are equal
     density: float
+    # Of `Sight.link`:
+    image: wp.vec3  # a point that the lens sees in the direction in which it arrives, in air alone [m]
+    begin: wp.vec3  # by a sea, where its way in the water begins [m]
+    along: wp.vec3  # and the unit vector along that
+    gather: float  # by a port or a sea, what the lens gets of an intensity without extinction, per its area [sr/m^2]
 
 
 @wp.struct
@@ -310,9 +315,9 @@ def _make_ways(face: wp.Function, aim_at: wp.Function) -> tuple[wp.Function, ...
             return c
         p = enter(port, o, aim.u)
         c.inside = -aim.u
-        c.to_port = -p.u
-        c.water = face(port, x, c.to_port, True, True)[3]
-        c.exit = x + c.water * c.to_port
+        c.to_lens = -p.u
+        c.water = face(port, x, c.to_lens, True, True)[3]
+        c.exit = x + c.water * c.to_lens
         c.path = c.water + p.path
         c.transmission = p.transmission
         c.density = aim.density
@@ -332,7 +337,7 @@ def _make_ways(face: wp.Function, aim_at: wp.Function) -> tuple[wp.Function, ...
 def _apparent_flat(port: Port, x: wp.vec3, o: wp.vec3, c: Connection) -> wp.vec3:
     """Where the ray of a connection from x to o meets the port's axis through o."""
     n = port.index
-    q_water = -n[2] * wp.dot(c.to_port, port.normal)
+    q_water = -n[2] * wp.dot(c.to_lens, port.normal)
     q_inside = -n[0] * wp.dot(c.inside, port.normal)
     q_glass = wp.sqrt(n[1] * n[1] - n[0] * n[0] + q_inside * q_inside)
     inside = port.distance - wp.dot(o, port.normal)
@@ -352,7 +357,7 @@ def apparent_centre(port: Port) -> wp.vec3:
 @wp.func
 def _apparent_dome(port: Port, x: wp.vec3, o: wp.vec3, c: Connection) -> wp.vec3:
     """The point of the ray of a connection from x to o that is nearest to o."""
-    return x + wp.dot(o - x, c.to_port) * c.to_port
+    return x + wp.dot(o - x, c.to_lens) * c.to_lens
 
 
 # ---- Kinds of ports, as the transport kernels take them, and their parameters from lengths and indices.

@@ -398,7 +398,7 @@ def _draw_point(
     surface, `behind` m before the end of the way, from a distribution of slopes: a slope moves it, to first order, by
     the slope over J in the plane of incidence and across it."""
     n = port.index
-    cos_x = -wp.dot(flat.to_port, port.normal)
+    cos_x = -wp.dot(flat.to_lens, port.normal)
     cos_o = -wp.dot(flat.inside, port.normal)
     gap = wp.abs(n[2] * cos_x - n[0] * cos_o)
     across_j = (n[2] / flat.water + n[0] / behind) / gap
@@ -410,7 +410,7 @@ def _draw_point(
     state = step_sequence(state)
     turn = cos_sin_turn(u01(sequence_word(state)))
     slope = (r * width[0] * turn[0]) * along + (r * width[1] * turn[1]) * wp.cross(up, along)
-    plane = flat.to_port + cos_x * port.normal  # along the plane of incidence
+    plane = flat.to_lens + cos_x * port.normal  # along the plane of incidence
     length = wp.length(plane)
     plane = wp.where(length > 1.0e-6, plane / wp.max(length, 1.0e-6), along)
     across = wp.cross(port.normal, plane)
@@ -459,8 +459,8 @@ def _make_connect(waves: bool) -> wp.Function:
             far = not near
             if far:
                 # And from there on to the height of the waves: about, for a lens that is much farther than x.
-                across = c.to_port + wp.dot(-c.to_port, port.normal) * port.normal
-                lower = side * facet_at(sea.waves, c.exit).height / wp.max(-wp.dot(c.to_port, port.normal), 0.1)
+                across = c.to_lens + wp.dot(-c.to_lens, port.normal) * port.normal
+                lower = side * facet_at(sea.waves, c.exit).height / wp.max(-wp.dot(c.to_lens, port.normal), 0.1)
                 c.exit -= lower * across
                 c.water -= wp.min(lower, 0.5 * c.water)
         drawn = _draw_point(port, c, wp.length(o - c.exit), sea.normal, sea.spread_along, sea.spread, seed)
@@ -475,15 +475,15 @@ def _make_connect(waves: bool) -> wp.Function:
         behind = wp.length(to_o)
         c.exit = s
         c.water = wp.length(to_s)
-        c.to_port = to_s / c.water
+        c.to_lens = to_s / c.water
         c.inside = to_o / behind
         c.transmission = 1.0
         c.density = 0.0
-        cosine = wp.dot(c.to_port, local.normal)
+        cosine = wp.dot(c.to_lens, local.normal)
         # Facets that turn their backs on x or on o let nothing through.
         if (cosine > 0.0) == below and (wp.dot(c.inside, local.normal) > 0.0) == below:
             area = c.water * c.water * behind * behind * wp.dot(local.normal, sea.normal)
-            density = passage_density(local, c.to_port, c.inside)
+            density = passage_density(local, c.to_lens, c.inside)
             c.density = density * wp.abs(cosine) / (area * wp.max(drawn[3], 1.0e-30))
         return c
 

@@ -8,7 +8,7 @@ coordinates and of the face itself, then the lower and the upper corner of each 
 import warp as wp
 
 from spadwarp_kernels.base import check
-from spadwarp_kernels.base.native import zeros
+from spadwarp_kernels.base.native import times_sign, zeros
 
 # Boxes and faces are widened by this part of the coordinates and distances: a few units in the last place of float32.
 WIDENING = wp.constant(4.0e-7)
@@ -32,18 +32,6 @@ _MOST_SLOTS = (2**31 - 1) // 144 * 8
 """)
 def load_plane(faces: wp.array[wp.vec4], slot: int, plane: int) -> wp.vec4:
     """Plane 0, 1 or 2 of the face in a slot; in one load on CUDA."""
-    ...
-
-
-@wp.func_native("""
-#if defined(__CUDA_ARCH__)
-    return __uint_as_float(__float_as_uint(x) ^ (__float_as_uint(sign) & 0x80000000u));
-#else
-    return __builtin_signbit(sign) ? -x : x;
-#endif
-""")
-def times_sign(x: float, sign: float) -> float:
-    """x, negated where the sign bit is set, also of a zero."""
     ...
 
 
