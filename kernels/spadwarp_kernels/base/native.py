@@ -48,6 +48,16 @@ def zeros(size: int, dtype: type, device: wp.DeviceLike) -> wp.array:
     return wp.array(memory, dtype=dtype, device="cpu", copy=False)
 
 
+def fill(struct: Any, device: wp.DeviceLike = None, **values: Any) -> Any:
+    """The struct with values in its fields; for those of arrays anything that makes one, on the device."""
+    for name, value in values.items():
+        kind = struct._cls.vars[name].type
+        if hasattr(kind, "ndim") and not isinstance(value, wp.array):
+            value = wp.array(value, dtype=kind.dtype, device=device)
+        setattr(struct, name, value)
+    return struct
+
+
 @wp.func_native("return values.data[index];")
 def load_float(values: wp.array[float], index: int) -> float:
     """`values[index]` of an array without gaps, 0 <= index: a quarter of the instructions."""
@@ -77,25 +87,6 @@ def load_vec2(values: wp.array[wp.vec2], index: int) -> wp.vec2:
 """)
 def load_row(rows: wp.array[wp.vec4], row: int) -> wp.vec4:
     """An entry of a contiguous array that no kernel changes, in one load on CUDA."""
-    ...
-
-
-# ---- Arguments of a kernel that its threads read again and again.
-
-
-@wp.func_native("""
-#if defined(__CUDA_ARCH__)
-    // Plus 0 in a launch along one axis, which the compiler does not know. Volatile: else it adds within the loop.
-    unsigned int held;
-    asm volatile("add.u32 %0, %1, %2;" : "=r"(held) : "r"(word), "r"(gridDim.y - 1u));
-    return held;
-#else
-    return word;
-#endif
-""")
-def held_word(word: wp.uint32) -> wp.uint32:
-    """The word, in a register that the warp shares from here on: else a compiler for CUDA reads an argument anew by an
-    instruction wherever it is used."""
     ...
 
 

@@ -7,7 +7,7 @@ one id gives the same numbers however a launch is cut up.
 import warp as wp
 
 from .kernels import memoised
-from .native import held_word
+from .native import fill
 
 __all__ = ["STREAM_ANALYTIC", "STREAM_DETECTOR", "STREAM_EMISSION", "STREAM_FLIGHT_SAMPLE", "STREAM_FRAMES"]
 __all__ += ["STREAM_ROULETTE", "STREAM_SURFACE", "STREAM_TRANSPORT", "random_block", "u01", "u01_tail"]
@@ -89,20 +89,9 @@ class RoundKeys:
 
 def round_keys(seed: int) -> RoundKeys:
     """The round keys of a seed of 64 bits."""
-    keys = RoundKeys()
-    for name, first, step in (("x", seed, int(_W0)), ("y", seed >> 32, int(_W1))):
-        setattr(keys, name, _Keys(*((first + i * step) & 0xFFFFFFFF for i in range(_ROUNDS))))
-    return keys
-
-
-@wp.func
-def hold_keys(keys: RoundKeys) -> RoundKeys:
-    """The keys in registers, see `held_word`, for a kernel that draws in a loop."""
-    kept = RoundKeys()
-    for i in range(wp.static(_ROUNDS)):
-        kept.x[i] = held_word(keys.x[i])
-        kept.y[i] = held_word(keys.y[i])
-    return kept
+    words = ((seed, int(_W0)), (seed >> 32, int(_W1)))
+    x, y = ([(first + i * step) & 0xFFFFFFFF for i in range(_ROUNDS)] for first, step in words)
+    return fill(RoundKeys(), x=x, y=y)
 
 
 @wp.func

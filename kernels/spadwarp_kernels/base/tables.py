@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 
 from . import check
 from .check import ArgumentError
+from .native import fill
 
 Floats = NDArray[np.float64]
 
@@ -158,7 +159,4 @@ def make_density_tables(*rows: Floats, device: wp.DeviceLike = None) -> DensityT
     """The tables that kernels take, from the cells that `tabulate` gives for each row."""
     cells = np.stack(rows).astype(np.float32)
     guide = [np.searchsorted(row[:, 1], lower_ends(), side="right") for row in cells]
-    tables = DensityTables()
-    tables.cells = wp.array(cells, dtype=wp.vec4, device=device)
-    tables.guide = wp.array(np.minimum(guide, cells.shape[1] - 1), dtype=int, device=device)
-    return tables
+    return fill(DensityTables(), device, cells=cells, guide=np.minimum(guide, cells.shape[1] - 1))

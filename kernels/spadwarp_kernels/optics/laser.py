@@ -11,6 +11,7 @@ from numpy.typing import ArrayLike, NDArray
 from spadwarp_kernels.base import check
 from spadwarp_kernels.base.check import ArgumentError
 from spadwarp_kernels.base.kernels import memoised
+from spadwarp_kernels.base.native import fill
 from spadwarp_kernels.base.philox import STREAM_EMISSION, random_block, u01, u01_fine, u01_open
 from spadwarp_kernels.base.rotations import cos_sin_turn, orthonormal_basis, rotate_direction
 
@@ -74,16 +75,12 @@ def make_laser(
     check.vector("axis", axis)
     length = math.hypot(*axis)
     check.number("length of axis", length, "(0, inf)")
-    laser = Laser()
-    laser.position, laser.axis = wp.vec3(*position), wp.vec3(*(x / length for x in axis))
-    laser.profile = LASER_PROFILES.index(profile)
+    laser = fill(Laser(), position=position, axis=[x / length for x in axis], profile=LASER_PROFILES.index(profile))
     if profile == "collimated":
-        laser.radius = value
-    elif profile == "gaussian":
-        laser.tan2 = math.tan(value) ** 2
-    else:
-        laser.spread = 2.0 * math.sin(0.5 * min(value, math.pi)) ** 2
-    return laser
+        return fill(laser, radius=value)
+    if profile == "gaussian":
+        return fill(laser, tan2=math.tan(value) ** 2)
+    return fill(laser, spread=2.0 * math.sin(0.5 * min(value, math.pi)) ** 2)
 
 
 @wp.func
@@ -207,9 +204,9 @@ def make_sun(
     height += check.number("crest", crest, "[0, inf)")
     position = (distance - height) * check.numbers("down", down, (3,))
     laser = make_laser("collimated", radius=0.0, axis=direction, position=position)
-    laser.down, laser.patch = wp.vec3(*down), wp.spatial_vector(*check.numbers("patch", patch, (2, 3)).ravel())
+    spread = check.number("sky", sky, "[0, 1]")
+    fill(laser, down=down, patch=check.numbers("patch", patch, (2, 3)).ravel(), spread=spread)
     check.number("cosine of direction to down", float(wp.dot(laser.axis, laser.down)), "(0, 1.000001]")
-    laser.spread = check.number("sky", sky, "[0, 1]")
     return laser
 
 

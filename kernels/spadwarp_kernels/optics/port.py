@@ -9,6 +9,7 @@ import warp as wp
 
 from spadwarp_kernels.base import check
 from spadwarp_kernels.base.check import ArgumentError
+from spadwarp_kernels.base.native import fill
 
 __all__ = ["DOME_PORT", "FLAT_PORT", "Port", "PortKind", "make_dome_port", "make_flat_port"]
 
@@ -432,10 +433,9 @@ def make_flat_port(
             f"distance = {distance} m: a lens or laser at {tuple(origin)} m of radius {aperture_radius} m reaches "
             f"through the port{waves}"
         )
-    port.normal, port.distance = wp.vec3(*normal), distance
     n = tuple(port.index)
     slopes = [_slopes(n[0], n[k], largest_angle) for k in (1, 2)]
-    port.glass_slope, port.water_slope = (wp.vec2(*bounds) for bounds in slopes)
+    fill(port, normal=normal, distance=distance, glass_slope=slopes[0], water_slope=slopes[1])
     tangent = max(1.0, slopes[0][1]) * math.tan(largest_angle)  # the largest inside and in the window
     longest = min(math.hypot(1.0, tangent), _FAR)
     _set_times(port, ((inside - tilt, (inside + tilt) * longest), (thickness, thickness * longest)))
@@ -478,8 +478,7 @@ def make_dome_port(
     check.number("radius", radius, "(0, 1e9]")
     check.vector("centre", centre)
     port = _port(thickness, index, group_index, origin, aperture_radius, largest_angle)
-    port.radius, port.centre = radius, wp.vec3(*centre)
-    n = tuple(port.index)
+    n = tuple(fill(port, radius=radius, centre=centre).index)
     furthest = math.dist(centre, origin) + aperture_radius
     if not furthest < min(1.0, n[1] / n[0], n[2] / n[0] * (1.0 + thickness / radius)) * radius:
         raise ArgumentError(
@@ -520,12 +519,10 @@ def _port(
         for k, value in enumerate(values):
             check.number(f"{name}[{k}]", value, "[1, inf)")
     check.number("largest_angle", largest_angle, "[0, 1.5707963]")
-    port = Port()
-    port.thickness = thickness
     # A window without thickness has no faces, and must not be the layer of the least index.
-    port.index = wp.vec3(index[0], index[1] if thickness > 0.0 else index[0], index[2])
-    port.delay = wp.vec2(group_index[0] / group_index[2], group_index[1] / group_index[2])
-    return port
+    index = (index[0], index[1] if thickness > 0.0 else index[0], index[2])
+    delay = (group_index[0] / group_index[2], group_index[1] / group_index[2])
+    return fill(Port(), thickness=thickness, index=index, delay=delay)
 
 
 def _slopes(inside: float, layer: float, angle: float) -> tuple[float, float]:

@@ -16,6 +16,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from spadwarp_kernels.base import check
 from spadwarp_kernels.base.check import ArgumentError
+from spadwarp_kernels.base.native import fill
 from spadwarp_kernels.base.philox import begin_sequence, sequence_word, step_sequence, u01, u01_fine, u01_open
 from spadwarp_kernels.base.rotations import cos_sin_turn
 from spadwarp_kernels.water.limits import fresnel_reflectance
@@ -646,24 +647,20 @@ def make_sea(
     check.number("delay", delay, "(0, 4]")
     up = np.array(normal, np.float64)
     wind = _level("along", np.eye(3)[np.argmin(np.abs(up))] if along is None else along, up)
-    sea = Sea()
-    sea.normal, sea.height, sea.along = wp.vec3(*normal), height, wp.vec3(*wind)
-    sea.slope = wp.vec2(*(math.sqrt(2.0 * variance) for variance in variances))
-    sea.index, sea.delay, sea.extinction = index, delay, extinction
-    sea.spread_along, sea.spread = sea.along, sea.slope
+    width = [math.sqrt(2.0 * variance) for variance in variances]
+    sea = fill(Sea(), normal=normal, height=height, along=wind, slope=width, spread_along=wind, spread=width)
+    fill(sea, index=index, delay=delay, extinction=extinction)
     if heights is not None:
         check.vector("origin", origin)
         first = wind if columns is None else _level("columns", columns, up)
         second = np.cross(up, first)
-        sea.waves = _make_waves(heights, size, device)
         rest = unresolved_covariance(variances, (wind @ first, wind @ second), heights, size)
         values, vectors = np.linalg.eigh(rest)
         place = np.array(origin, np.float64)
         place += (height - place @ up) * up
-        sea.waves.normal, sea.waves.origin = sea.normal, wp.vec3(*place)
-        sea.waves.columns, sea.waves.rows = wp.vec3(*first), wp.vec3(*second)
-        sea.along = wp.vec3(*(vectors[0, 1] * first + vectors[1, 1] * second))
-        sea.slope = wp.vec2(math.sqrt(2.0 * values[1]), math.sqrt(2.0 * values[0]))
+        waves = fill(_make_waves(heights, size, device), normal=normal, origin=place, columns=first, rows=second)
+        steep = (math.sqrt(2.0 * values[1]), math.sqrt(2.0 * values[0]))
+        fill(sea, waves=waves, along=vectors[0, 1] * first + vectors[1, 1] * second, slope=steep)
     return sea
 
 
@@ -679,15 +676,11 @@ def _level(name: str, vector: ArrayLike, up: NDArray[np.float64]) -> NDArray[np.
 def _make_waves(heights: ArrayLike, size: Sequence[float], device: wp.DeviceLike) -> Waves:
     """A height field that is still to be placed."""
     h = _checked(heights, size)
-    waves = Waves()
-    waves.heights = wp.array(h.astype(np.float32), dtype=float, device=device)
-    waves.cell = wp.vec2(size[0] / h.shape[1], size[1] / h.shape[0])
-    margin = 0.01 * float(np.ptp(h)) + 1e-4
-    waves.low, waves.high = float(h.min()) - margin, float(h.max()) + margin
+    cell, margin = (size[0] / h.shape[1], size[1] / h.shape[0]), 0.01 * float(np.ptp(h)) + 1e-4
+    bounds = {"low": float(h.min()) - margin, "high": float(h.max()) + margin}
     # Slopes are bilinear in a cell's corners: the largest are at its corners.
     along, across = (np.maximum(np.abs(p), np.abs(q)) for p, q in _edges(h, size))
-    waves.steepest = float(np.hypot(along, across).max())
-    return waves
+    return fill(Waves(), device, heights=h, cell=cell, **bounds, steepest=float(np.hypot(along, across).max()))
 
 
 def _checked(heights: ArrayLike, size: Sequence[float]) -> NDArray[np.float64]:

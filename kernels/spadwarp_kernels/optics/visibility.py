@@ -283,10 +283,10 @@ class Sight(NamedTuple):
     clip: wp.Function  # as `clip_to_view`, holding the part of a flight that lies in the view
     shows: wp.Function  # as `in_view`
     gate: wp.Function  # ``(camera, gate) -> Gate`` of `clip_to_gate`, for what arrives within the gate
-    may_hide: wp.Function  # as `may_be_hidden`, whose map is of straight lines to a lens that stands still: else True
+    may_hide: wp.Function  # as `may_be_hidden`, of straight lines to a lens that stands still; else True
     leave: wp.Function  # ``(camera, x, u) -> PortRay``, see `PortKind`; without a port straight on
-    # ``(camera, sea, x, o, at_sea, seed) -> Connection``; `at_sea`: x is a point of the sea's surface; `seed`: 64 random bits
-    # for a sea
+    # ``(camera, sea, x, o, at_sea, seed) -> Connection``; `at_sea`: x is a point of the surface of a sea; `seed`: 64
+    # random bits for a sea
     link: wp.Function
     value: wp.Function  # ``(camera, extinction, weight, scattering, link) -> float``, part of the photon that arrives
     apparent: wp.Function  # ``(camera, x, o) -> vec3``, from where the light of o seems to come at x
@@ -370,27 +370,24 @@ def _make_ways(port: PortKind | None, sea: SeaKind | None) -> tuple[wp.Function,
     @wp.func
     def apparent(camera: Camera, x: wp.vec3, o: wp.vec3) -> wp.vec3:
         seen = wp.vec3(o)
-        if wp.static(bends):
-            if wp.static(not by_sea) or _lies_across(camera, x):
-                way = connect(camera.port, x, o)
-                if way.density > 0.0:
-                    seen = apparent_of(camera.port, x, o, way)
+        if wp.static(bends) and (wp.static(not by_sea) or _lies_across(camera, x)):
+            way = connect(camera.port, x, o)
+            if way.density > 0.0:
+                seen = apparent_of(camera.port, x, o, way)
         return seen
 
     @wp.func
     def toward(camera: Camera, x: wp.vec3, o: wp.vec3) -> wp.vec3:
         straight = wp.normalize(o - x)
-        if wp.static(bends):
-            if wp.static(not by_sea) or _lies_across(camera, x):
-                way = connect(camera.port, x, o)
-                straight = wp.where(way.density > 0.0, way.to_lens, straight)
+        if wp.static(bends) and (wp.static(not by_sea) or _lies_across(camera, x)):
+            way = connect(camera.port, x, o)
+            straight = wp.where(way.density > 0.0, way.to_lens, straight)
         return straight
 
     @wp.func
     def toward_centre(camera: Camera, x: wp.vec3) -> wp.vec3:
-        if wp.static(bends):
-            if wp.static(not by_sea) or _lies_across(camera, x):
-                return wp.normalize(apparent_centre(camera.port) - x)
+        if wp.static(bends) and (wp.static(not by_sea) or _lies_across(camera, x)):
+            return wp.normalize(apparent_centre(camera.port) - x)
         return (-1.0 / wp.max(wp.length(x), 1.0e-30)) * x
 
     return value_of, apparent, toward, toward_centre

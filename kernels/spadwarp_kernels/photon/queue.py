@@ -4,7 +4,6 @@ import warp as wp
 
 from spadwarp_kernels.base.kernels import memoised
 from spadwarp_kernels.base.native import bits_of, from_bits
-from spadwarp_kernels.tally.tally import BACKSCATTER
 
 from .spec import TransportSpec
 from .state import Carried, PhotonRef, SinkRef, WorldRef
@@ -148,23 +147,6 @@ def queue_vector(memory: int, put: bool, entry: int, value: wp.vec4) -> wp.vec4:
     ...
 
 
-@wp.func_native(f"""
-#if defined(__CUDA_ARCH__)
-    float4* mine = static_cast<float4*>(__cvta_shared_to_generic(static_cast<unsigned int>(memory))) + {_QUEUE} + begin;
-    float2* pairs = reinterpret_cast<float2*>(mine);
-    if (put) pairs[entry] = make_float2(value[0], value[1]);
-    const float2 held = pairs[entry];
-    return wp::vec2(held.x, held.y);
-#else
-    return value;
-#endif
-""")
-def queue_pair(memory: int, put: bool, begin: int, entry: int, value: wp.vec2) -> wp.vec2:
-    """Writes or reads one of the pairs of numbers that the warp's queue has where its vectors from `begin` on would be;
-    CUDA alone."""
-    ...
-
-
 ADD_ENTRY, READ_SIZE, SET_SIZE = (wp.constant(i) for i in range(3))
 
 
@@ -226,30 +208,12 @@ def long_queue_fits(spec: TransportSpec, in_tree: bool) -> bool:
     return spec.grid is None and 16 * (_QUEUE + vectors * entries) * BLOCK_SIZE // 32 <= kib * 1024
 
 
-def _make_words(spec: TransportSpec, more: bool, begin: int) -> tuple[wp.Function, wp.Function]:
+def _make_words(confocal: bool, begin: int) -> tuple[wp.Function, wp.Function]:
     """Two Warp functions that write, ``(memory, entry, request)``, and read, ``(memory, entry, request) -> Request``,
-    what a request has beside x, u, weight and path: a vector from `begin` on, or a pair where requests are of
-    scatterings in water alone, which need one random word beside that of the tally. `more`: see `_has_more`."""
-    confocal = spec.confocal
-    short = not (spec.mesh or more or spec.derivatives or spec.polarised or spec.lines or spec.grid or spec.sea)
+    what a request has beside x, u, weight and path: a vector from `begin` on."""
 
     @wp.func
-    def write_pair(memory: int, entry: int, request: Request):
-        words = wp.vec2(from_bits(int(request.first)), from_bits(int(request.rounding_sample)))
-        queue_pair(memory, True, wp.static(begin), entry, words)
-
-    @wp.func
-    def read_pair(memory: int, entry: int, request: Request) -> Request:
-        words = queue_pair(memory, False, wp.static(begin), entry, wp.vec2())
-        request.first = wp.uint32(bits_of(words[0]))
-        request.rounding_sample = wp.uint32(bits_of(words[1]))
-        request.component = BACKSCATTER
-        request.target = -1
-        request.slot = -1
-        return request
-
-    @wp.func
-    def write_vector(memory: int, entry: int, request: Request):
+    def write(memory: int, entry: int, request: Request):
         packed = request.component + int(request.rounding_sample & _UPPER_24)
         queue_vector(
             memory,
@@ -264,7 +228,7 @@ def _make_words(spec: TransportSpec, more: bool, begin: int) -> tuple[wp.Functio
         )
 
     @wp.func
-    def read_vector(memory: int, entry: int, request: Request) -> Request:
+    def read(memory: int, entry: int, request: Request) -> Request:
         c = queue_vector(memory, False, entry + wp.static(begin), wp.vec4())
         request.first = wp.uint32(bits_of(c[0]))
         request.second = wp.uint32(bits_of(c[1]))
@@ -275,7 +239,7 @@ def _make_words(spec: TransportSpec, more: bool, begin: int) -> tuple[wp.Functio
         request.target = wp.where(wp.static(confocal), bits_of(c[3]), -1)
         return request
 
-    return (write_pair, read_pair) if short else (write_vector, read_vector)
+    return write, read
 
 
 @memoised
@@ -297,7 +261,7 @@ def make_queue(
     lines, derivative_vectors = spec.lines, -(-len(spec.derivatives) // 4)
     carried = 3 + more
     entries, vectors = _size(spec, flights, long)
-    write_words, read_words = _make_words(spec, more, 2 * entries)
+    write_words, read_words = _make_words(confocal, 2 * entries)
     warp_memory = _make_memory(vectors * entries * used, flights and long and not traces)
 
     @wp.func

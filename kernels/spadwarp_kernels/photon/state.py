@@ -11,7 +11,7 @@ from spadwarp_kernels.optics.camera import BEFORE, Camera, Gate, gate_bin
 from spadwarp_kernels.optics.laser import Laser, Scan
 from spadwarp_kernels.optics.polarisation import Polarisation
 from spadwarp_kernels.optics.sea import Sea
-from spadwarp_kernels.surface.bvh import NO_NODE, TreeWalk
+from spadwarp_kernels.surface.bvh import TreeWalk
 from spadwarp_kernels.surface.mesh import Surfaces
 from spadwarp_kernels.surface.ray_cast import SurfaceHit
 from spadwarp_kernels.tally import ledger
@@ -96,14 +96,6 @@ class Launch:
     threads: int
     cursor: wp.array[int]  # how many photons have been handed out to warps
     offset: wp.array[wp.uint64]  # added to the ids of a stepped spec
-
-
-@wp.struct
-class Draws:
-    """The random numbers of a thread."""
-
-    base: wp.uint64  # id of the launch's first photon
-    keys: RoundKeys  # those of the world, held in registers on CUDA
 
 
 @wp.struct
@@ -194,6 +186,7 @@ class PhotonState:
     first: int  # number of the first of the warp's 32 new photons within the launch
     taken: int  # how many of them have been taken
     # The photon:
+    base: wp.uint64  # id of the launch's first photon
     photon: int  # number within the launch
     x: wp.vec3  # position [m]
     u: wp.vec3  # unit direction
@@ -241,22 +234,6 @@ SinkRef: TypeAlias = wp.ref[Sink]
 AccountRef: TypeAlias = wp.ref[Account]
 CarriedRef: TypeAlias = wp.ref[Carried]
 PhotonRef: TypeAlias = wp.ref[PhotonState]
-
-
-@wp.func
-def first_state(world: WorldRef, slot: int) -> PhotonState:
-    """A thread before its first photon."""
-    s = PhotonState()
-    s.stage = START
-    s.account.slot = slot
-    s.first = -1
-    s.taken = 32
-    s.albedo = world.medium.albedo
-    s.view = world.camera.view
-    s.target = -1
-    s.hit.face = -1  # for good where there is no mesh: so a compiler leaves out what is done on faces
-    s.walk.node = NO_NODE
-    return s
 
 
 @wp.func

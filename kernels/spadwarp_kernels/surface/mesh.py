@@ -8,6 +8,7 @@ import warp as wp
 
 from spadwarp_kernels.base import check
 from spadwarp_kernels.base.check import ArgumentError
+from spadwarp_kernels.base.native import fill
 from spadwarp_kernels.optics.camera import Camera
 from spadwarp_kernels.optics.visibility import near_depth_map
 
@@ -250,16 +251,8 @@ def surface_choices(surfaces: Surfaces) -> dict[str, bool]:
 
 def no_textures(device: wp.DeviceLike = None) -> Textures:
     """Empty arrays in place of `make_textures`."""
-    return _textures(np.zeros(0), np.zeros((0, 3, 2)), np.zeros((0, 3)), np.zeros(0), device)
-
-
-def _textures(face: Any, coordinates: Any, region: Any, texels: Any, device: wp.DeviceLike) -> Textures:
-    textures = Textures()
-    textures.face = wp.array(np.asarray(face, np.int32), dtype=int, device=device)
-    textures.coordinates = wp.array(np.asarray(coordinates, np.float32), dtype=wp.vec2, device=device)
-    textures.region = wp.array(np.asarray(region, np.int32), dtype=wp.vec3i, device=device)
-    textures.texels = wp.array(np.asarray(texels, np.float32), dtype=float, device=device)
-    return textures
+    made = fill(Textures(), device, face=np.zeros(0), coordinates=np.zeros((0, 3, 2)))
+    return fill(made, device, region=np.zeros((0, 3)), texels=np.zeros(0))
 
 
 def make_textures(
@@ -286,4 +279,5 @@ def make_textures(
     coordinates = check.numbers("coordinates", coordinates, (face.size, 3, 2), "(-inf, inf)")
     ends = np.cumsum([0, *(image.size for image in images)])
     region = [(start, image.shape[1], image.shape[0]) for start, image in zip(ends, images, strict=False)]
-    return _textures(face, coordinates, region, np.concatenate([image.ravel() for image in images]), device)
+    texels = np.concatenate([image.ravel() for image in images])
+    return fill(Textures(), device, face=face, coordinates=coordinates, region=region, texels=texels)

@@ -21,15 +21,15 @@ from . import stages
 class Stages(NamedTuple):
     """What becomes of a photon, as Warp functions; states are changed in place."""
 
-    prepare: wp.Function  # ``(draws, world, thread, launch) -> int``, of a thread
+    prepare: wp.Function  # ``(world, thread, launch) -> PhotonState``, of a thread
     emit: wp.Function  # see `Beam.emit`
     begin: wp.Function  # ``(s, world, sink, emitted, id)``, to FLIGHT
-    fly: wp.Function  # ``(s, world, draws, words)``, to EVENT or RAY
+    fly: wp.Function  # ``(s, world, words)``, to EVENT or RAY
     trace: wp.Function  # ``(s, world)``, from RAY to EVENT, without other threads
     meet: wp.Function  # ``(s, world, distance) -> bool``, whether the flight ends on the face at that distance [m]
     cross: wp.Function  # ``(s, world, sink)``, what the photon itself brings on its flight
     collide: wp.Function  # ``(s, world, sink)``, to SCATTER or END
-    scatter: wp.Function  # ``(s, world, sink, draws)``, to FLIGHT or END
+    scatter: wp.Function  # ``(s, world, sink)``, to FLIGHT or END
     finish: wp.Function  # ``(s, sink)``
     flush: wp.Function  # ``(s, sink)``, of a thread
     # ``(s, world, sink, memory)``: the flight and the event are scored, or what is to be scored goes to the queue.

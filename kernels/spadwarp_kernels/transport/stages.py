@@ -9,9 +9,9 @@ from spadwarp_kernels.estimators.estimator import Direction
 from spadwarp_kernels.optics.sea import FACETS, sample_passage
 from spadwarp_kernels.photon import state
 from spadwarp_kernels.photon.spec import TransportSpec
-from spadwarp_kernels.photon.state import Draws, Launch, PhotonRef, SinkRef, WorldRef
+from spadwarp_kernels.photon.state import Launch, PhotonRef, PhotonState, SinkRef, WorldRef
 from spadwarp_kernels.riders.riders import make_rider
-from spadwarp_kernels.surface.bvh import NOWHERE, segment_meets_box
+from spadwarp_kernels.surface.bvh import NO_NODE, NOWHERE, segment_meets_box
 from spadwarp_kernels.surface.patches import nearest_patch
 from spadwarp_kernels.surface.ray_cast import intersect_surfaces, offset_from_surface, patch_hit
 from spadwarp_kernels.surface.reflectance import (
@@ -28,20 +28,26 @@ from spadwarp_kernels.water import limits
 
 
 def make_prepare(stepped: bool, in_blocks: bool, cuda: bool) -> wp.Function:
-    """The Warp function ``(draws, world, thread, launch) -> int``: readies the random numbers of a thread; its slot of
-    the ledger."""
+    """The Warp function ``(world, thread, launch) -> PhotonState`` of a thread before its first photon."""
 
     @wp.func
-    def prepare(draws: wp.ref[Draws], world: WorldRef, thread: int, launch: Launch) -> int:
+    def prepare(world: WorldRef, thread: int, launch: Launch) -> PhotonState:
         if wp.static(in_blocks):
             world.derivatives.blocks.thread = thread
-        draws.base = launch.first_id
+        s = PhotonState()
+        s.stage = state.START
+        s.account.slot = thread if wp.static(cuda) else slot_of_core(launch.first_id)
+        s.base = launch.first_id
         if wp.static(stepped):
-            draws.base += launch.offset[0]
-        draws.keys = philox.hold_keys(world.keys)
-        if wp.static(cuda):
-            return thread
-        return slot_of_core(launch.first_id)
+            s.base += launch.offset[0]
+        s.first = -1
+        s.taken = 32
+        s.albedo = world.medium.albedo
+        s.view = world.camera.view
+        s.target = -1
+        s.hit.face = -1  # for good where there is no mesh: so a compiler leaves out what is done on faces
+        s.walk.node = NO_NODE
+        return s
 
     return prepare
 
@@ -160,7 +166,7 @@ def make_meet(choose: wp.Function | None) -> wp.Function:
 def make_fly(
     spec: TransportSpec, plan_flight: wp.Function | None, meet: wp.Function, random_albedo: bool, cuda: bool
 ) -> wp.Function:
-    """The Warp function ``(s, world, draws, words)``: lets a photon fly, to EVENT or, where a tree of faces may be
+    """The Warp function ``(s, world, words)``: lets a photon fly, to EVENT or, where a tree of faces may be
     in its way, to RAY.
 
     On a CPU `words`, PREFETCHED_WORDS of them, keep the random words of the photon's next flights. They are drawn for
@@ -172,15 +178,15 @@ def make_fly(
     has_bvh, sea = spec.faces.mesh and not tried, spec.sight.sea is not None
 
     @wp.func
-    def fly(s: PhotonRef, world: WorldRef, draws: wp.ref[Draws], words: wp.array[int]):
-        id = draws.base + wp.uint64(s.photon)
+    def fly(s: PhotonRef, world: WorldRef, words: wp.array[int]):
+        id = s.base + wp.uint64(s.photon)
         event = wp.uint32(s.collisions + 1)
         if wp.static(cuda):
-            s.flight.block = random_block_keyed(draws.keys, id, event, philox.STREAM_TRANSPORT)
+            s.flight.block = random_block_keyed(world.keys, id, event, philox.STREAM_TRANSPORT)
         else:
             k = s.collisions & last
             if k == 0:
-                prefetch(words, draws.keys, id, event)
+                prefetch(words, world.keys, id, event)
             s.flight.block = philox.prefetched_block(words, k)
         seed = join_words(s.flight.block[0], s.flight.block[2])
         xi = u01_tail(s.flight.block[0], s.flight.block[2])
@@ -193,7 +199,7 @@ def make_fly(
         s.flight.reach = wp.min(s.flight.distance, limit)
         if wp.static(plans):
             if wp.static(cuda):
-                s.flight.sample_block = random_block_keyed(draws.keys, id, event, philox.STREAM_FLIGHT_SAMPLE)
+                s.flight.sample_block = random_block_keyed(world.keys, id, event, philox.STREAM_FLIGHT_SAMPLE)
             else:
                 s.flight.sample_block = philox.prefetched_block(words, events + k)
             plan = plan_flight(s, s.flight.sample_block, world)
@@ -206,7 +212,7 @@ def make_fly(
         s.flight.factor = 1.0
         s.stage = state.EVENT
         if wp.static(random_albedo):
-            s.albedo = world.medium.albedo * u01(random_block_keyed(draws.keys, id, event, philox.STREAM_ROULETTE)[1])
+            s.albedo = world.medium.albedo * u01(random_block_keyed(world.keys, id, event, philox.STREAM_ROULETTE)[1])
         if wp.static(has_bvh):
             if segment_meets_box(s.x, s.u, s.flight.reach, world.surfaces.lower, world.surfaces.upper):
                 s.stage = state.RAY
@@ -502,7 +508,7 @@ def make_meet_sea(spec: TransportSpec, lose: wp.Function) -> wp.Function:
 
 
 def make_scatter(spec: TransportSpec, direct: wp.Function | None, flies_on: bool) -> wp.Function:
-    """The Warp function ``(s, world, sink, draws)``: takes a photon from its event to FLIGHT, or to END.
+    """The Warp function ``(s, world, sink)``: takes a photon from its event to FLIGHT, or to END.
 
     `flies_on`: see `make_continues`.
     """
@@ -564,10 +570,10 @@ def make_scatter(spec: TransportSpec, direct: wp.Function | None, flies_on: bool
         s.surface_count += wp.where(on_surface, 1, 0)
 
     @wp.func
-    def scatter(s: PhotonRef, world: WorldRef, sink: SinkRef, draws: wp.ref[Draws]):
+    def scatter(s: PhotonRef, world: WorldRef, sink: SinkRef):
         # Here, not in `collide`: there a select takes the place of the branch, and a core waits for the flight.
         s.collisions += 1
-        id = draws.base + wp.uint64(s.photon)
+        id = s.base + wp.uint64(s.photon)
         bounced = False
         if wp.static(spec.domain.reflects):
             bounced = s.bounces.face > 0

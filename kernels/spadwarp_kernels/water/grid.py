@@ -19,7 +19,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from spadwarp_kernels.base import check
 from spadwarp_kernels.base.check import ArgumentError
-from spadwarp_kernels.base.native import load_float, load_vec2
+from spadwarp_kernels.base.native import fill, load_float, load_vec2
 from spadwarp_kernels.base.philox import begin_sequence, sequence_word, step_sequence, u01, u01_open
 from spadwarp_kernels.base.rotations import inverse_direction
 
@@ -377,6 +377,7 @@ def make_grid(
     """
     device = check.device("device", device)
     arrays = {"extinction": check.numbers("extinction", extinction, (None,) * 3, "[0, inf)").astype(np.float32)}
+    arrays["anisotropy"] = np.zeros(0, np.float32)
     shape = arrays["extinction"].shape
     check.integer("number of cells", math.prod(shape), 1, LARGEST_CELL_COUNT)
     arrays["albedo"] = check.numbers("albedo", albedo, shape, "[0, 1]").astype(np.float32)
@@ -391,26 +392,16 @@ def make_grid(
     edge_cells = max(1, math.ceil(longest / 6)) if block_edge is None else block_edge
     edge_cells = check.integer("block_edge", edge_cells, 1, longest)
 
-    grid = Grid()
     turn = (np.array(shape) / np.array(size, np.float64))[:, None] * axes.T
-    grid.turn = wp.mat33(*turn.ravel().tolist())
-    grid.shift = wp.vec3(*(0.5 * np.array(shape) - turn @ np.asarray(centre, np.float64)).tolist())
-    grid.size = wp.vec3i(*shape)
-    for name, array in arrays.items():
-        setattr(grid, name, wp.array(array.ravel(), dtype=float, device=device))
-    grid.shares = wp.array(mixture_shares(shares, shape), dtype=wp.vec4, device=device)
-    if anisotropy is None:
-        grid.anisotropy = wp.empty(0, dtype=float, device=device)
-    blocks = block_statistics(arrays["extinction"], edge_cells)
-    grid.block_edge = edge_cells
-    grid.block_size = wp.vec3i(*blocks[0].shape)
-    grid.block_majorant = wp.array(blocks[0].ravel(), dtype=float, device=device)
-    grid.block_control = wp.array(np.stack([b.ravel() for b in blocks[1:]], axis=1), dtype=wp.vec2, device=device)
-    mean = blocks[1]
+    shift = 0.5 * np.array(shape) - turn @ np.asarray(centre, np.float64)
+    majorant, mean, deviation = block_statistics(arrays["extinction"], edge_cells)
+    control, blocks = np.stack([mean.ravel(), deviation.ravel()], axis=1), majorant.shape
     for axis, count in enumerate(shape):
         mean = np.repeat(mean, edge_cells, axis=axis).take(range(count), axis=axis)
-    grid.residual = wp.array((arrays["extinction"] - mean).ravel(), dtype=float, device=device)
-    return grid
+    cells = {name: array.ravel() for name, array in arrays.items()} | {"shares": mixture_shares(shares, shape)}
+    grid = fill(Grid(), device, turn=turn, shift=shift, size=shape, **cells)
+    fill(grid, device, residual=(arrays["extinction"] - mean).ravel(), block_edge=edge_cells, block_size=blocks)
+    return fill(grid, device, block_majorant=majorant.ravel(), block_control=control)
 
 
 def block_statistics(extinction: NDArray[np.float32], edge: int) -> tuple[NDArray[np.float32], ...]:

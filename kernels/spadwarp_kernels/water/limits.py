@@ -12,11 +12,13 @@ import itertools
 from collections.abc import Sequence
 from typing import NamedTuple
 
+import numpy as np
 import warp as wp
 
 from spadwarp_kernels.base import check
 from spadwarp_kernels.base.check import ArgumentError
 from spadwarp_kernels.base.kernels import memoised
+from spadwarp_kernels.base.native import fill
 
 __all__ = ["Boundary", "Limits", "make_boundary"]
 
@@ -147,11 +149,8 @@ def make_boundary(
     ]
     chains = [chain for chain in itertools.product(*numbers) if 0 < sum(map(abs, chain)) <= most]
     images = sorted(chains, key=lambda chain: (sum(map(abs, chain)), chain))
-    boundary = Boundary()
-    boundary.low, boundary.high = (wp.vec3(*indices) for indices in sides)
-    boundary.images = wp.array(images, dtype=wp.vec3i, device=check.device("device", device), shape=len(images))
-    boundary.max_reflections = most
-    return boundary
+    ways, device = np.reshape(images, (-1, 3)).astype(np.int32), check.device("device", device)
+    return fill(Boundary(), device, low=sides[0], high=sides[1], images=ways, max_reflections=most)
 
 
 # ---- The box and the limits.
