@@ -38,10 +38,7 @@ _LARGE = 1 << 22
 
 
 def zeros(size: int, dtype: type, device: wp.DeviceLike) -> wp.array:
-    """`wp.zeros`, on the CPU in large pages, so that a core need not look up the page of each voxel that it adds to.
-
-    `dtype`: int64 or vec4.
-    """
+    """`wp.zeros` of int64 or vec4, on the CPU in large pages: a core need not look up the page of each voxel."""
     if wp.get_device(device).is_cuda or size * wp.types.type_size_in_bytes(dtype) < _LARGE:
         return wp.zeros(size, dtype=dtype, device=device)
     memory = np.zeros((size, 4), np.float32) if dtype is wp.vec4 else np.zeros(size, np.int64)

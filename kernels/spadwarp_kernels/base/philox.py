@@ -135,10 +135,8 @@ def u01_open(word: wp.uint32) -> float:
 
 @wp.func
 def u01_tail(word: wp.uint32, more: wp.uint32) -> float:
-    """Uniform float32 in [2^-41, 1] from a word and the last 8 bits of another, which `u01` leaves.
-
-    For logarithms: -ln reaches 28.4, and the probability of more than l is exp(-l) to 0.1 % up to l = 20.
-    """
+    """Uniform float32 in [2^-41, 1] from a word and the last 8 bits of another, which `u01` leaves. For logarithms: -ln
+    reaches 28.4, and the probability of more than l is exp(-l) to 0.1 % up to l = 20."""
     return float(word) * 2.3283064365386963e-10 + (float(more & wp.uint32(0xFF)) + 0.5) * 9.094947017729282e-13
 
 
@@ -176,10 +174,8 @@ _CODE = """
 @memoised
 def make_prefetch(*streams: int) -> tuple[int, wp.Function]:
     """How many events, a power of 2, and the Warp function ``(words, keys, id, event)`` that writes the blocks of these
-    events, from `event` on, of each stream into an array of PREFETCHED_WORDS integers, see `prefetched_block`.
-
-    The number of streams must divide 8.
-    """
+    events, from `event` on, of each stream into an array of PREFETCHED_WORDS integers, see `prefetched_block`. The
+    number of streams divides 8."""
     events = _BLOCKS // len(streams)
     steps = [str(lane % events) for lane in range(_BLOCKS)]
     ids = [str(int(streams[lane // events])) for lane in range(_BLOCKS)]

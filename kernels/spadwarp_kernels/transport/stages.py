@@ -258,7 +258,7 @@ class Collision:
 def make_collide(spec: TransportSpec, chosen: bool, flies_on: bool, score_flux: wp.Function | None) -> wp.Function:
     """The Warp function ``(s, world, sink)``: takes a photon to the end of its flight, and on to SCATTER or to END.
 
-    `chosen`: an estimator chooses what ends a flight; `flies_on`: see `make_continues`; `score_flux`: see
+    `chosen`: an estimator chooses what ends a flight; `flies_on`: see `continues`; `score_flux`: see
     `make_flux_score`.
     """
     domain, rider, sea = spec.domain, make_rider(spec), spec.sight.sea is not None
@@ -402,17 +402,11 @@ def make_sample_direction(spec: TransportSpec, direct: wp.Function | None) -> wp
     return sample_direction
 
 
-def make_continues(flies_on: bool) -> wp.Function:
-    """The Warp function ``reason -> bool``: whether there is a flight after an event.
-
-    `flies_on`: the light of a history's last event is scored as it flies, to where the next event would be.
-    """
-
-    @wp.func
-    def continues(reason: int) -> bool:
-        return reason < 0 or (wp.static(flies_on) and reason != ledger.ROULETTE)
-
-    return continues
+@wp.func
+def continues(reason: int, flies_on: bool) -> bool:
+    """Whether there is a flight after an event; `flies_on`: the light of a history's last event is scored as it flies,
+    to where the next event would be."""
+    return reason < 0 or (flies_on and reason != ledger.ROULETTE)
 
 
 def make_terminate(spec: TransportSpec) -> wp.Function:
@@ -440,9 +434,9 @@ def make_lose(spec: TransportSpec, directed: bool, flies_on: bool) -> wp.Functio
     """The Warp function ``(s, world, sink, id, part, entry) -> bool``: a boundary sends on a part of the photon, and an
     entry of the ledger takes the rest; whether there is a flight.
 
-    `directed`: weight and analog weight differ; `flies_on`: see `make_continues`.
+    `directed`: weight and analog weight differ; `flies_on`: see `continues`.
     """
-    terminate, continues = make_terminate(spec), make_continues(flies_on)
+    terminate = make_terminate(spec)
 
     @wp.func
     def lose(s: PhotonRef, world: WorldRef, sink: SinkRef, id: wp.uint64, part: float, entry: int) -> bool:
@@ -458,7 +452,7 @@ def make_lose(spec: TransportSpec, directed: bool, flies_on: bool) -> wp.Functio
         s.weight = new.weight
         s.analog_weight = new.analog_weight
         s.reason = new.reason
-        return continues(new.reason)
+        return continues(new.reason, wp.static(flies_on))
 
     return lose
 
@@ -510,11 +504,11 @@ def make_meet_sea(spec: TransportSpec, lose: wp.Function) -> wp.Function:
 def make_scatter(spec: TransportSpec, direct: wp.Function | None, flies_on: bool) -> wp.Function:
     """The Warp function ``(s, world, sink)``: takes a photon from its event to FLIGHT, or to END.
 
-    `flies_on`: see `make_continues`.
+    `flies_on`: see `continues`.
     """
     directed, sea, rider = direct is not None, spec.sight.sea is not None, make_rider(spec)
     sample_direction, terminate = make_sample_direction(spec, direct), make_terminate(spec)
-    continues, lose = make_continues(flies_on), make_lose(spec, directed, flies_on)
+    lose = make_lose(spec, directed, flies_on)
     bounce, meet_sea = make_bounce(spec, lose), make_meet_sea(spec, lose)
 
     @wp.func
@@ -562,7 +556,7 @@ def make_scatter(spec: TransportSpec, direct: wp.Function | None, flies_on: bool
             new.weight.value *= survival[0]
         new.analog_weight = wp.where(wp.static(directed), s.analog_weight * survival[0], new.weight.value)
         terminate(new, s, world, sink, id)
-        if continues(new.reason):
+        if continues(new.reason, wp.static(flies_on)):
             turn(new, s, world, sink, id, on_surface, survival[1])
         s.weight = new.weight
         s.analog_weight = new.analog_weight
@@ -585,6 +579,6 @@ def make_scatter(spec: TransportSpec, direct: wp.Function | None, flies_on: bool
                 meet_sea(s, world, sink, id)
         if not bounced:
             collision(s, world, sink, id)
-        s.stage = wp.where(continues(s.reason), state.FLIGHT, state.END)
+        s.stage = wp.where(continues(s.reason, wp.static(flies_on)), state.FLIGHT, state.END)
 
     return scatter
