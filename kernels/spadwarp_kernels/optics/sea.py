@@ -617,7 +617,7 @@ def make_sea(
     origin: Sequence[float] = (0.0, 0.0, 0.0),
     device: wp.DeviceLike = None,
 ) -> Sea:
-    """The surface of the sea.
+    """The surface of the sea. Raises `ArgumentError`.
 
     Args:
         variances: Of all slopes along and across the wind, see `slope_variances`; both 0 for a flat surface.
@@ -633,9 +633,6 @@ def make_sea(
         columns: Direction along a row, of any length, not along the normal; default: that of the wind.
         origin: A point above or below the first node [m].
         device: Where the heights are stored.
-
-    Raises:
-        ArgumentError: A number out of its range.
     """
     check.vector("variances", variances, size=2)
     for k, variance in enumerate(variances):

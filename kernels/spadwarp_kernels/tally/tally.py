@@ -420,7 +420,7 @@ def tally_rates(
     parameters: int = 1,
     parameter: int = 0,
 ) -> wp.array:
-    """Tallies added up over components, float32 `[pixel, bin]` on their device.
+    """Tallies added up over components, float32 `[pixel, bin]` on their device. Raises `ArgumentError`.
 
     Args:
         tally: int64, `Data.tally`, or `Data.gradients` with so many `parameters`.
@@ -429,9 +429,6 @@ def tally_rates(
         components: How many of `tally_components`, from the first on; by default all.
         parameters: Derivatives side by side in a voxel.
         parameter: Which of them.
-
-    Raises:
-        ArgumentError: Arrays or numbers that do not fit each other.
     """
     check.array("scale", scale, wp.float64, (None,), tally.device if isinstance(tally, wp.array) else None)
     bins, parameters = check.integer("bins", bins, 1), check.integer("parameters", parameters, 1)

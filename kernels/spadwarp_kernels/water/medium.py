@@ -42,10 +42,7 @@ class Medium:
 
 def make_medium(absorption: float, scattering: float, *, anisotropy: float = 0.0) -> Medium:
     """Water from its coefficients [1/m], 0 or more, with the mean cosine g of its phase function in (-1, 1).
-
-    Raises:
-        ArgumentError: A number out of range.
-    """
+    Raises `ArgumentError`."""
     check.within("[0, inf)", absorption=absorption, scattering=scattering)
     extinction, g = absorption + scattering, check.number("anisotropy", anisotropy, "(-1, 1)")
     albedo = scattering / extinction if extinction > 0.0 else 0.0
@@ -98,6 +95,7 @@ def make_lines(
     device: wp.DeviceLike = None,
 ) -> Lines:
     """Up to MOST_LINES lines, with the phase function of the medium for what is scattered later.
+    Raises `ArgumentError`.
 
     Args:
         source: Coefficients of the inelastic scattering [1/m], >= 0, `[water, line]`; the water's absorption has it. Of
@@ -109,9 +107,6 @@ def make_lines(
         media: The medium, or the waters of the layers, at the laser's wavelength; the scattering is above 0.
         elastic: The lines are of the laser, and light of a line is there from the start.
         delay: Group index at the line over that of the medium, by default 1.
-
-    Raises:
-        ArgumentError: A number out of range, or lists of several lengths.
     """
     device, lines, waters = check.device("device", device), Lines(), len(check.items("media", media))
     count = check.integer("number of lines", len(check.items("passed", passed)), 1, MOST_LINES)
@@ -152,8 +147,7 @@ class Grid:
     size: wp.vec3i  # number of cells along the three edges
     extinction: wp.array[float]  # c [1/m] by cell, the last edge fastest
     albedo: wp.array[float]  # single-scattering albedo in [0, 1]
-    anisotropy: wp.array[float]
-    """g in (-1, 1), for phase functions that use the medium's; empty: the medium's everywhere."""
+    anisotropy: wp.array[float]  # g in (-1, 1), if the phase function uses the medium's; empty: that everywhere
     block_edge: int  # cells along the edges of a block
     block_size: wp.vec3i  # number of blocks along the three edges of the box; the last may be incomplete
     block_majorant: wp.array[float]  # largest c in each block [1/m]
@@ -171,8 +165,7 @@ class Layers:
     """
 
     axis: wp.vec3  # unit vector
-    start: wp.array[float]
-    """Position along the axis, x·axis, at which each layer begins [m], ascending; the first is not read."""
+    start: wp.array[float]  # position x·axis at which each layer begins [m], ascending; the first is not read
     extinction: wp.array[float]  # c [1/m], > 0
     albedo: wp.array[float]  # single-scattering albedo in [0, 1]
     anisotropy: wp.array[float]  # g in (-1, 1), for phase functions that use the medium's
