@@ -584,10 +584,8 @@ def unresolved_covariance(
     variances: Sequence[float], along: Sequence[float], heights: ArrayLike, size: Sequence[float]
 ) -> NDArray[np.float64]:
     """Covariance of the slopes that a height field leaves to facets, along its rows and from row to row, `[2, 2]`.
-
     `along`: the wind's direction along both, of any length; else as in `make_sea`. Raises `ArgumentError` where less
-    than a tenth of the variance on an axis is left.
-    """
+    than a tenth of the variance on an axis is left."""
     resolved = facet_covariance(heights, size)
     wind = np.array(along, np.float64) / math.hypot(*along)
     turn = np.array([wind, [-wind[1], wind[0]]])

@@ -242,13 +242,9 @@ def close_batch_kernel(
     overflow: wp.array[int],
 ):
     """Adds a batch to the total, to `half` if that is as long, and the square of its sum over components, times
-    `weight`, to a 128-bit sum, and empties it.
-
-    `sums` takes its components, over voxels; `overflow` is set where a total leaves [least, 2^62).
-
-    Integers, so that the sums depend neither on the order of the batches nor on how they were merged.
-    Launch: runs of `run` voxels from the `first` on.
-    """
+    `weight`, to a 128-bit sum, and empties it. `sums` takes its components, over voxels; `overflow` is set where a
+    total leaves [least, 2^62). Integers, so that the sums depend neither on the order of the batches nor on how they
+    were merged. Launch: runs of `run` voxels from the `first` on."""
     voxels = squares_low.shape[0]
     begin = (first + wp.tid()) * run
     end = wp.min(begin + run, voxels)
@@ -358,9 +354,7 @@ class Batches:
 
     def add(self, other: "Batches") -> None:
         """Adds the batches of another tally of the same components, which may be on another device and must rest.
-
-        Raises `ArgumentError` for another size or number of components.
-        """
+        Raises `ArgumentError` for another size or number of components."""
         check.kind("other", other, Batches)
         if other.second_moment[0].size != self.second_moment[0].size:
             raise ArgumentError(f"other has {other.second_moment[0].size} voxels, not {self.second_moment[0].size}")
