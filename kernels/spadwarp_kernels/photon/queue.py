@@ -204,47 +204,12 @@ def long_queue_fits(spec: TransportSpec, in_tree: bool) -> bool:
     return spec.grid is None and 16 * (_QUEUE + vectors * entries) * BLOCK_SIZE // 32 <= kib * 1024
 
 
-def _make_words(confocal: bool, begin: int) -> tuple[wp.Function, wp.Function]:
-    """Two Warp functions that write, ``(memory, entry, request)``, and read, ``(memory, entry, request) -> Request``,
-    what a request has beside x, u, weight and path: a vector from `begin` on."""
-
-    @wp.func
-    def write(memory: int, entry: int, request: Request):
-        packed = request.component + int(request.rounding_sample & _UPPER_24)
-        queue_vector(
-            memory,
-            True,
-            entry + wp.static(begin),
-            wp.vec4(
-                from_bits(int(request.first)),
-                from_bits(int(request.second)),
-                from_bits(packed),
-                from_bits(wp.where(wp.static(confocal), request.target, request.slot)),
-            ),
-        )
-
-    @wp.func
-    def read(memory: int, entry: int, request: Request) -> Request:
-        c = queue_vector(memory, False, entry + wp.static(begin), wp.vec4())
-        request.first = wp.uint32(bits_of(c[0]))
-        request.second = wp.uint32(bits_of(c[1]))
-        packed = bits_of(c[2])
-        request.component = packed & 3
-        request.rounding_sample = wp.uint32(packed)
-        request.slot = bits_of(c[3])
-        request.target = wp.where(wp.static(confocal), bits_of(c[3]), -1)
-        return request
-
-    return write, read
-
-
 @memoised
 def make_queue(
     spec: TransportSpec, flights: bool, used: bool, long: bool, traces: bool
 ) -> tuple[wp.Function, wp.Function, wp.Function]:
     """Three Warp functions: ``memory() -> int``, see `_make_memory`; ``push(s, request, world, sink, memory)`` adds
-    what is wanted; ``pop(memory, lane, takes, size, count) -> Request``, the last ones for the so many lanes that take
-    one.
+    what is wanted; ``pop(memory, lane, takes, size, count) -> Request``, the last for so many lanes that take one.
 
     Args:
         spec: Of the requests.
@@ -257,7 +222,6 @@ def make_queue(
     lines, derivative_vectors = spec.lines, -(-len(spec.derivatives) // 4)
     carried = 3 + more
     entries, vectors = _size(spec, flights, long)
-    write_words, read_words = _make_words(confocal, 2 * entries)
     warp_memory = _make_memory(vectors * entries * used, flights and long and not traces)
 
     @wp.func
@@ -272,7 +236,9 @@ def make_queue(
     def write(memory: int, entry: int, request: Request):
         put(memory, entry, 0, wp.vec4(request.x[0], request.x[1], request.x[2], request.weight))
         put(memory, entry, 1, wp.vec4(request.u[0], request.u[1], request.u[2], request.path))
-        write_words(memory, entry, request)
+        packed = from_bits(request.component + int(request.rounding_sample & _UPPER_24))
+        last = from_bits(wp.where(wp.static(confocal), request.target, request.slot))
+        put(memory, entry, 2, wp.vec4(from_bits(int(request.first)), from_bits(int(request.second)), packed, last))
         if wp.static(more):
             lens = wp.vec2(request.lens[0], request.lens[1])
             if request.interval[0] >= request.interval[1]:
@@ -307,7 +273,13 @@ def make_queue(
         request.weight = a[3]
         request.u = wp.vec3(b[0], b[1], b[2])
         request.path = b[3]
-        request = read_words(memory, entry, request)
+        c = get(memory, entry, 2)
+        request.first = wp.uint32(bits_of(c[0]))
+        request.second = wp.uint32(bits_of(c[1]))
+        request.component = bits_of(c[2]) & 3
+        request.rounding_sample = wp.uint32(bits_of(c[2]))
+        request.slot = bits_of(c[3])
+        request.target = wp.where(wp.static(confocal), bits_of(c[3]), -1)
         if wp.static(more):
             d = get(memory, entry, 3)
             request.interval = wp.vec2(d[0], d[1])

@@ -194,31 +194,20 @@ class Ray:
 
 
 @wp.func
-def next_ray(s: PhotonRef) -> int:
-    """The ray that a thread traces: that which it has begun, that of its photon, or a shadow ray."""
-    ray = s.ray
-    if ray == state.NO_RAY:
-        ray = wp.where(s.stage == state.RAY, state.SURFACE_RAY, wp.where(s.hidden, state.SHADOW_RAY, state.NO_RAY))
+def next_ray(s: PhotonRef, scores: bool) -> Ray:
+    """The ray that a thread traces: that which it has begun, its photon's flight, or the way to the lens."""
+    if s.ray == state.NO_RAY:
+        s.ray = wp.where(s.stage == state.RAY, state.SURFACE_RAY, wp.where(s.hidden, state.SHADOW_RAY, state.NO_RAY))
+    ray = Ray()
+    ray.origin = s.x
+    ray.direction = s.u
+    ray.length = s.flight.reach
+    if scores:
+        if s.ray == state.SHADOW_RAY:
+            ray.origin = s.origin
+            ray.direction = wp.normalize(s.lens - s.origin)
+            ray.length = wp.length(s.lens - s.origin)
     return ray
-
-
-def _make_ray_geometry(scores: bool) -> wp.Function:
-    """The Warp function ``s -> Ray``: the flight, or the way from the scored point to the lens."""
-
-    @wp.func
-    def ray_geometry(s: PhotonRef) -> Ray:
-        ray = Ray()
-        ray.origin = s.x
-        ray.direction = s.u
-        ray.length = s.flight.reach
-        if wp.static(scores):
-            if s.ray == state.SHADOW_RAY:
-                ray.origin = s.origin
-                ray.direction = wp.normalize(s.lens - s.origin)
-                ray.length = wp.length(s.lens - s.origin)
-        return ray
-
-    return ray_geometry
 
 
 def _make_end_walk(stages: Stages) -> wp.Function:
@@ -245,7 +234,7 @@ def _make_end_walk(stages: Stages) -> wp.Function:
 def _make_loop_tree(stages: Stages, options: dict) -> wp.Kernel:
     """Warps that leave the water when enough of their lanes wait for a ray, and walk down the tree together."""
     used, flights = stages.scores, stages.flights
-    renew, ray_geometry, end_walk = _make_renew(stages), _make_ray_geometry(used), _make_end_walk(stages)
+    renew, end_walk = _make_renew(stages), _make_end_walk(stages)
     ray_lanes, walking_lanes = (GUIDED_RAY_LANES, GUIDED_WALKING_LANES) if flights else (RAY_LANES, WALKING_LANES)
     rounds = 2 if flights and not stages.two_requests else 1
     scatter_first = used and rounds == 1
@@ -299,8 +288,7 @@ def _make_loop_tree(stages: Stages, options: dict) -> wp.Kernel:
                 status.waiting = queue.count_lanes(s.stage != state.FLIGHT)
 
             # ---- Surfaces: the warp traces its rays together
-            s.ray = next_ray(s)
-            ray = ray_geometry(s)
+            ray = next_ray(s, wp.static(used))
             if s.ray != state.NO_RAY and s.walk.node == NO_NODE:
                 s.walk.node = 0
                 s.walk.found = -1

@@ -278,15 +278,14 @@ def make_collide(spec: TransportSpec, chosen: bool, flies_on: bool, score_flux: 
                 c.distance = wp.min(c.distance, leaves.distance)
         if wp.static(reflects):
             # By distance: a photon that has been reflected may be outside by a rounding error.
-            exit = domain.exit_distance(world.limits, s.x, s.u)
-            if exit < c.distance:
-                c.distance = exit
+            leaves = domain.exit(world.limits, s.x, s.u)
+            if leaves.distance < c.distance:
+                c.distance = leaves.distance
                 c.reason = -1
-                face = domain.exit(world.limits, s.x, s.u).face
-                if limits.face_index(world.limits.boundary, face) > 0.0:
-                    c.mirror = face
+                if limits.face_index(world.limits.boundary, leaves.face) > 0.0:
+                    c.mirror = leaves.face
                 else:
-                    c.reason = ledger.EXIT + face
+                    c.reason = ledger.EXIT + leaves.face
         if wp.static(sea):
             if c.reason < 0 and s.hit.face < 0 and s.flight.distance == s.flight.sea:
                 c.mirror = state.SEA_FACE

@@ -222,7 +222,6 @@ class Domain(NamedTuple):
     turn_back: wp.Function  # the inverse
     is_outside: wp.Function  # ``(limits, x) -> bool``, outside the domain or beyond the lateral limit
     exit: wp.Function  # ``(limits, x, u) -> Exit``, of what a ray meets first
-    exit_distance: wp.Function  # ``(limits, x, u) -> float``, the distance of that [m]
     within: wp.Function  # ``(limits, length, x, u) -> float``, the part of a flight in a bounded domain [m]
     bounded: bool
     rotated: bool
@@ -271,12 +270,8 @@ def make_domain(bounded: bool, rotated: bool, reflects: bool) -> Domain:
         return next_face(limits, to_sides(limits, x, u), point(limits, x), turn(limits, u))
 
     @wp.func
-    def exit_distance(limits: Limits, x: wp.vec3, u: wp.vec3) -> float:
-        return exit(limits, x, u).distance
-
-    @wp.func
     def within(limits: Limits, length: float, x: wp.vec3, u: wp.vec3) -> float:
-        return wp.min(length, exit_distance(limits, x, u)) if wp.static(bounded) else length
+        return wp.min(length, exit(limits, x, u).distance) if wp.static(bounded) else length
 
     axes = (point, point_back, turn, turn_back)
-    return Domain(*axes, is_outside, exit, exit_distance, within, bounded, rotated, reflects)
+    return Domain(*axes, is_outside, exit, within, bounded, rotated, reflects)
