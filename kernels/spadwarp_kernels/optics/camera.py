@@ -256,7 +256,7 @@ def make_camera(
         focus: Depth that is imaged sharply [m].
     """
     width, height = check.integer("width", width, 1), check.integer("height", height, 1)
-    check.number("pixel_tangent", pixel_tangent, "(0, inf)")
+    pixel_tangent = check.number("pixel_tangent", pixel_tangent, "(0, inf)")
     radius = check.number("aperture_radius", aperture_radius, "[0, inf)")
     area = check.number("aperture_area", math.pi * radius**2 if aperture_area is None else aperture_area, "[0, inf)")
     if radius > 0.0 and abs(area - math.pi * radius**2) > 0.01 * math.pi * radius**2:

@@ -43,8 +43,9 @@ class Medium:
 def make_medium(absorption: float, scattering: float, *, anisotropy: float = 0.0) -> Medium:
     """Water from its coefficients [1/m], 0 or more, with the mean cosine g of its phase function in (-1, 1).
     Raises `ArgumentError`."""
-    check.within("[0, inf)", absorption=absorption, scattering=scattering)
-    extinction, g = absorption + scattering, check.number("anisotropy", anisotropy, "(-1, 1)")
+    scattering = check.number("scattering", scattering, "[0, inf)")
+    extinction = check.number("absorption", absorption, "[0, inf)") + scattering
+    g = check.number("anisotropy", anisotropy, "(-1, 1)")
     albedo = scattering / extinction if extinction > 0.0 else 0.0
     return fill(Medium(), extinction=extinction, albedo=albedo, anisotropy=g, axis_threshold=1.0)
 
