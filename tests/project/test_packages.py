@@ -136,12 +136,12 @@ LINES = {
     "kernels/detection": (1000, 1440),
     "kernels/estimators": (1300, 1081),
     "kernels/optics": (1350, 2538),
-    "kernels/photon": (850, 1131),
+    "kernels/photon": (850, 1102),
     "kernels/riders": (750, 708),
     "kernels/surface": (1700, 1833),
     "kernels/tally": (450, 1046),
-    "kernels/transport": (1450, 1649),
-    "kernels/water": (1350, 1501),
+    "kernels/transport": (1450, 1636),
+    "kernels/water": (1350, 1497),
     "kernels/worlds": (1600, 2156),
 }
 

@@ -219,8 +219,7 @@ def make_queue(
         traces: Whether there are lanes that take none, since they wait for a shadow ray.
     """
     confocal, polarised, has_slot, more = spec.confocal, spec.polarised, spec.mesh or spec.sea, _has_more(spec, flights)
-    lines, derivative_vectors = spec.lines, -(-len(spec.derivatives) // 4)
-    carried = 3 + more
+    lines, derivative_vectors, carried = spec.lines, -(-len(spec.derivatives) // 4), 3 + more
     entries, vectors = _size(spec, flights, long)
     warp_memory = _make_memory(vectors * entries * used, flights and long and not traces)
 
