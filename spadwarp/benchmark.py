@@ -331,7 +331,7 @@ class TransportRun:
         self._data = sk.make_data(self._model)
         wp.synchronize_device(device)
         ready = time.perf_counter()
-        sk.load_transport_kernel(self._spec, device, model=self._model)
+        sk.load_transport_kernel(self._spec, device)
         self.setup, self.compile = ready - began, time.perf_counter() - ready
         self.faces = 0 if mesh is None else mesh.face_count
         self.tally_bytes = 8 * self._model.tally_size if scores else None

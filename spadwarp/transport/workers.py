@@ -139,7 +139,7 @@ class DeviceWorker:
                 self._histograms.append(_Histogram(self.data.flux, 1, signed=False, batched=batched))
             # Compiles, or loads from Warp's cache, before the time of the launches is taken.
             self._most = min(launch_size, batch_size or launch_size)
-            sk.load_transport_kernel(spec, model.device, model=model, photon_count=self._most)
+            sk.load_transport_kernel(spec, model.device)
         self._closed = list[_Closed]()
         self._unread = list[tuple[int, bool]]()  # batches closed on the device: photons, and whether in the half
         self._running = deque[tuple[int, wp.Event]]()  # launches on a GPU: photons, and their end

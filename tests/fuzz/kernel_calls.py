@@ -130,7 +130,7 @@ def _valid_calls():
         "two_term": (sk.two_term_henyey_greenstein_density, dict(t=0.5, g1=0.5, g2=-0.1, alpha=0.9)),
         "near_depth_map": (near_depth_map, dict(mesh=mesh, camera=lit_box()["camera"])),
         "load_kernel": (sk.load_transport_kernel, dict(
-            spec=sk.TransportSpec("next_event"), device="cpu", model=model, photon_count=20)),
+            spec=sk.TransportSpec("next_event"), device="cpu")),
         "add_tallies": (sk.add_tallies, dict(total=tallies(), more=tallies())),
         "batches": (lambda close, **rest: sk.Batches(**rest).close(close), dict(
             tally=tallies(), component_count=3, total=None, close=tallies())),

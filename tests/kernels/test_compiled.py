@@ -97,6 +97,6 @@ def test_the_kernel_that_is_loaded_is_launched(device, monkeypatch):
     monkeypatch.setattr(launch, "make_transport_kernel", lambda *choices: made.append(make(*choices)) or made[-1])
     model = sk.Model(device, mesh=None, surfaces=sk.make_surfaces(None, device=device), scale=2.0**50, **lit_box())
     spec = sk.TransportSpec("next_event", mesh=False)
-    sk.load_transport_kernel(spec, device, model=model, photon_count=20)
+    sk.load_transport_kernel(spec, device)
     sk.launch_transport(spec, model, sk.make_data(model), seed=1, first_id=0, photon_count=20)
     assert len(made) == 2 and made[0] is made[1]

@@ -14,7 +14,7 @@ from helpers.statistics_of_samples import DEVICES
 from spadwarp.device import pick_device
 from spadwarp.mesh import build_mesh
 from spadwarp.transport.model import build_model, transport_spec
-from spadwarp_kernels.tally.tally import add_to_words, fold_accumulators
+from spadwarp_kernels.tally.tally import add_pending, fold_accumulators
 
 PENCIL = {
     "laser": {"profile": "collimated", "position": [0.0, 0.0, 0.0]},
@@ -93,7 +93,7 @@ def add_kernel(
     split_accumulators: wp.array(dtype=wp.uint32),
 ):
     i = wp.tid()
-    add_to_words(tally, split_accumulators, voxel[i], value[i])
+    _ = add_pending(tally, split_accumulators, wp.vec2l(), voxel[i], value[i])
 
 
 @pytest.mark.parametrize("device", DEVICES[1:])

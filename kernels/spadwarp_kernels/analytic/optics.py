@@ -169,7 +169,7 @@ def _make_camera(kind: PortKind | None) -> tuple[wp.Function, ...]:
             return x, -wp.dot(normal, x) / r * (x[2] / r) / (r * r), r
         c = connect(lidar.ports.camera, wp.vec3(x), wp.vec3(0.0))
         ray = -wp.vec3d(c.inside)
-        cos_out = wp.dot(normal, wp.vec3d(c.to_port))
+        cos_out = wp.dot(normal, wp.vec3d(c.to_lens))
         return ray, cos_out * ray[2] * wp.float64(c.density * c.transmission), wp.float64(c.water)
 
     return see, beside, footprint, receive
@@ -225,7 +225,7 @@ def _light_in_water(lidar: Lidar, x: wp.vec3d) -> LaserConnection:
 @wp.func
 def facet_spread(port: Port, slope: wp.float64, c: Connection) -> wp.float64:
     """Variance across a way through the surface of a sea, along an axis, of where its facets send it [m^2]."""
-    bend = port.index[0] / port.index[2] * wp.dot(c.inside, port.normal) - wp.dot(c.to_port, port.normal)
+    bend = port.index[0] / port.index[2] * wp.dot(c.inside, port.normal) - wp.dot(c.to_lens, port.normal)
     aside = slope * wp.float64(c.water * bend)
     return aside * aside
 
@@ -281,7 +281,7 @@ def _make_beam(kind: PortKind | None, rough: bool) -> tuple[wp.Function, ...]:
             return out
         out.path = wp.float64(c.path)
         out.water = wp.float64(c.water)
-        out.u = -wp.normalize(wp.vec3d(c.to_port))
+        out.u = -wp.normalize(wp.vec3d(c.to_lens))
         # The density is that of light from x to the laser; the other way the index goes with it.
         ratio = wp.float64(port.index[2]) / wp.float64(port.index[0])
         spread = ratio * ratio * wp.float64(c.density) * wp.float64(c.transmission)
@@ -352,7 +352,7 @@ def _make_range_of_path(kind: PortKind | None) -> wp.Function:
                 r = TWO * r + wp.float64(1.0e-3)
             else:
                 # The path rises with the range by 1 + the cosine between both directions of light.
-                slope = wp.max(ONE - wp.dot(wp.vec3d(c.to_port), sight.u), wp.float64(1.0e-3))
+                slope = wp.max(ONE - wp.dot(wp.vec3d(c.to_lens), sight.u), wp.float64(1.0e-3))
                 step = (left - wp.float64(c.path) - r) / slope
                 r = wp.max(r + step, least)
                 if wp.abs(step) <= wp.float64(1.0e-4) * r:

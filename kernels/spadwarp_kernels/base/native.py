@@ -18,6 +18,18 @@ def from_bits(bits: int) -> float:
     return wp.cast(bits, float)
 
 
+@wp.func_native("""
+#if defined(__CUDA_ARCH__)
+    return __uint_as_float(__float_as_uint(x) ^ (__float_as_uint(sign) & 0x80000000u));
+#else
+    return __builtin_signbit(sign) ? -x : x;
+#endif
+""")
+def times_sign(x: float, sign: float) -> float:
+    """x, negated where the sign bit is set, also of a zero."""
+    ...
+
+
 # ---- Memory that is read and written all over.
 
 
@@ -26,14 +38,21 @@ _LARGE = 1 << 22
 
 
 def zeros(size: int, dtype: type, device: wp.DeviceLike) -> wp.array:
-    """`wp.zeros`, on the CPU in large pages, so that a core need not look up the page of each voxel that it adds to.
-
-    `dtype`: int64 or vec4.
-    """
+    """`wp.zeros` of int64 or vec4, on the CPU in large pages: a core need not look up the page of each voxel."""
     if wp.get_device(device).is_cuda or size * wp.types.type_size_in_bytes(dtype) < _LARGE:
         return wp.zeros(size, dtype=dtype, device=device)
     memory = np.zeros((size, 4), np.float32) if dtype is wp.vec4 else np.zeros(size, np.int64)
     return wp.array(memory, dtype=dtype, device="cpu", copy=False)
+
+
+def fill(struct: Any, device: wp.DeviceLike = None, **values: Any) -> Any:
+    """The struct with values in its fields; for those of arrays anything that makes one, on the device."""
+    for name, value in values.items():
+        kind = struct._cls.vars[name].type
+        if hasattr(kind, "ndim") and not isinstance(value, wp.array):
+            value = wp.array(value, dtype=kind.dtype, device=device)
+        setattr(struct, name, value)
+    return struct
 
 
 @wp.func_native("return values.data[index];")
@@ -55,22 +74,16 @@ def load_vec2(values: wp.array[wp.vec2], index: int) -> wp.vec2:
     ...
 
 
-# ---- Arguments of a kernel that its threads read again and again.
-
-
 @wp.func_native("""
 #if defined(__CUDA_ARCH__)
-    // Plus 0 in a launch along one axis, which the compiler does not know. Volatile: else it adds within the loop.
-    unsigned int held;
-    asm volatile("add.u32 %0, %1, %2;" : "=r"(held) : "r"(word), "r"(gridDim.y - 1u));
-    return held;
+    const float4 v = __ldg(reinterpret_cast<const float4*>(rows.data) + static_cast<int64_t>(row));
+    return wp::vec4(v.x, v.y, v.z, v.w);
 #else
-    return word;
+    return rows.data[row];
 #endif
 """)
-def held_word(word: wp.uint32) -> wp.uint32:
-    """The word, in a register that the warp shares from here on: else a compiler for CUDA reads an argument anew by an
-    instruction wherever it is used."""
+def load_row(rows: wp.array[wp.vec4], row: int) -> wp.vec4:
+    """An entry of a contiguous array that no kernel changes, in one load on CUDA."""
     ...
 
 

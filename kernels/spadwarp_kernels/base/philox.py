@@ -7,7 +7,7 @@ one id gives the same numbers however a launch is cut up.
 import warp as wp
 
 from .kernels import memoised
-from .native import held_word
+from .native import fill
 
 __all__ = ["STREAM_ANALYTIC", "STREAM_DETECTOR", "STREAM_EMISSION", "STREAM_FLIGHT_SAMPLE", "STREAM_FRAMES"]
 __all__ += ["STREAM_ROULETTE", "STREAM_SURFACE", "STREAM_TRANSPORT", "random_block", "u01", "u01_tail"]
@@ -89,20 +89,9 @@ class RoundKeys:
 
 def round_keys(seed: int) -> RoundKeys:
     """The round keys of a seed of 64 bits."""
-    keys = RoundKeys()
-    for name, first, step in (("x", seed, int(_W0)), ("y", seed >> 32, int(_W1))):
-        setattr(keys, name, _Keys(*((first + i * step) & 0xFFFFFFFF for i in range(_ROUNDS))))
-    return keys
-
-
-@wp.func
-def hold_keys(keys: RoundKeys) -> RoundKeys:
-    """The keys in registers, see `held_word`, for a kernel that draws in a loop."""
-    kept = RoundKeys()
-    for i in range(wp.static(_ROUNDS)):
-        kept.x[i] = held_word(keys.x[i])
-        kept.y[i] = held_word(keys.y[i])
-    return kept
+    words = ((seed, int(_W0)), (seed >> 32, int(_W1)))
+    x, y = ([(first + i * step) & 0xFFFFFFFF for i in range(_ROUNDS)] for first, step in words)
+    return fill(RoundKeys(), x=x, y=y)
 
 
 @wp.func
@@ -146,10 +135,8 @@ def u01_open(word: wp.uint32) -> float:
 
 @wp.func
 def u01_tail(word: wp.uint32, more: wp.uint32) -> float:
-    """Uniform float32 in [2^-41, 1] from a word and the last 8 bits of another, which `u01` leaves.
-
-    For logarithms: -ln reaches 28.4, and the probability of more than l is exp(-l) to 0.1 % up to l = 20.
-    """
+    """Uniform float32 in [2^-41, 1] from a word and the last 8 bits of another, which `u01` leaves. For logarithms: -ln
+    reaches 28.4, and the probability of more than l is exp(-l) to 0.1 % up to l = 20."""
     return float(word) * 2.3283064365386963e-10 + (float(more & wp.uint32(0xFF)) + 0.5) * 9.094947017729282e-13
 
 
@@ -187,10 +174,8 @@ _CODE = """
 @memoised
 def make_prefetch(*streams: int) -> tuple[int, wp.Function]:
     """How many events, a power of 2, and the Warp function ``(words, keys, id, event)`` that writes the blocks of these
-    events, from `event` on, of each stream into an array of PREFETCHED_WORDS integers, see `prefetched_block`.
-
-    The number of streams must divide 8.
-    """
+    events, from `event` on, of each stream into an array of PREFETCHED_WORDS integers, see `prefetched_block`. The
+    number of streams divides 8."""
     events = _BLOCKS // len(streams)
     steps = [str(lane % events) for lane in range(_BLOCKS)]
     ids = [str(int(streams[lane // events])) for lane in range(_BLOCKS)]

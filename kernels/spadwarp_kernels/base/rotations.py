@@ -76,12 +76,9 @@ def cotangent(angle: float) -> float:
     return v;
 """)
 def set_apart(v: wp.vec3) -> wp.vec3:
-    """The same vector, of which a compiler for CUDA does not know that it is the same.
-
-    What is computed from it shares no products with the rest of a kernel. Whether a product and a sum become one
-    operation, which rounds once, depends on who else needs the product: without this, more work in one place would
-    change the last bits of another.
-    """
+    """The same vector, of which a compiler for CUDA does not know that it is: what is computed from it shares no
+    products with the rest of a kernel. Whether a product and a sum become one operation, which rounds once, depends on
+    who else needs the product: more work in one place would change the last bits of another."""
     ...
 
 
@@ -121,11 +118,8 @@ def orthonormal_basis(n: wp.vec3):
 
 @wp.func
 def rotate_direction(u: wp.vec3, t: float, xi: float) -> wp.vec3:
-    """The unit vector at angle theta from u, t = 1 - cos(theta), at azimuth 2 pi xi.
-
-    Exact on an orthonormal basis; equal in distribution to eq 15 of Lu et al. 2024, which divides by zero along the
-    axis.
-    """
+    """The unit vector at angle theta from u, t = 1 - cos(theta), at azimuth 2 pi xi, exact on an orthonormal basis;
+    equal in distribution to eq 15 of Lu et al. 2024, which divides by zero along the axis."""
     return rotate_by(u, t, cos_sin_turn(xi))
 
 
@@ -150,11 +144,9 @@ OFF_AXIS = wp.constant(2.0)
 
 @wp.func
 def snap_from(u: wp.vec3, least: float) -> wp.vec3:
-    """The near-axis rule (Lu et al. 2024, eq 16): the z axis with u's sign where |u_z| >= least, else u.
-
-    A scattering takes the result as its incoming direction, in the density and as the axis of the sampled phase
-    function; the flight keeps u. 0.9998 drops up to 1.15 degrees of tilt, OFF_AXIS switches the rule off.
-    """
+    """The near-axis rule (Lu et al. 2024, eq 16): the z axis with u's sign where |u_z| >= least, else u. A scattering
+    takes it as its incoming direction, in the density and as the axis of what is sampled; the flight keeps u. 0.9998
+    drops up to 1.15 degrees of tilt, OFF_AXIS switches the rule off."""
     if wp.abs(u[2]) >= least:
         return wp.vec3(0.0, 0.0, one_with_sign(u[2]))
     return u

@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 
 from . import check
 from .check import ArgumentError
+from .native import fill
 
 Floats = NDArray[np.float64]
 
@@ -111,10 +112,8 @@ def table_sample(tables: DensityTables, row: int, xi: float) -> float:
 
 
 def folded_quadrature() -> tuple[Floats, Floats]:
-    """Folded coordinates and weights for an integral over [0, 1], `[2, cells of a half, 16]`, the upper half second.
-
-    A function may rise towards either end as y^-0.95.
-    """
+    """Folded coordinates and weights for an integral over [0, 1], `[2, cells of a half, 16]`, the upper half second. A
+    function may rise towards either end as y^-0.95."""
     node, weight = np.polynomial.legendre.leggauss(16)
     node, weight = 0.5 * node + 0.5, 0.5 * weight
     width = np.diff(_NODES)[:, None]
@@ -125,11 +124,9 @@ def folded_quadrature() -> tuple[Floats, Floats]:
 
 
 def tabulate(density: Callable[[Floats], Floats]) -> Floats:
-    """The cells of a density in float64, `[cells, 4]`, from a density of any scale over folded coordinates.
-
-    Up to 2^-33 from an end the density is replaced by its mean there. Raises `ArgumentError` if it is negative, not
-    finite or zero everywhere.
-    """
+    """The cells of a density in float64, `[cells, 4]`, from a density of any scale over folded coordinates. Up to 2^-33
+    from an end the density is replaced by its mean there. Raises `ArgumentError` if it is negative, not finite or zero
+    everywhere."""
     z, weight = folded_quadrature()
     values = check.numbers("density(t)", density(z), z.shape, "[0, inf)")
     if not values.any():
@@ -158,7 +155,4 @@ def make_density_tables(*rows: Floats, device: wp.DeviceLike = None) -> DensityT
     """The tables that kernels take, from the cells that `tabulate` gives for each row."""
     cells = np.stack(rows).astype(np.float32)
     guide = [np.searchsorted(row[:, 1], lower_ends(), side="right") for row in cells]
-    tables = DensityTables()
-    tables.cells = wp.array(cells, dtype=wp.vec4, device=device)
-    tables.guide = wp.array(np.minimum(guide, cells.shape[1] - 1), dtype=int, device=device)
-    return tables
+    return fill(DensityTables(), device, cells=cells, guide=np.minimum(guide, cells.shape[1] - 1))

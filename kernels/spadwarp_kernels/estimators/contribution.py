@@ -7,8 +7,9 @@ from spadwarp_kernels.base.native import from_bits
 from spadwarp_kernels.base.philox import join_words, u01, u01_fine, u01_high, u01_low
 from spadwarp_kernels.base.rotations import cotangent, one_minus_cosine, snap_from
 from spadwarp_kernels.optics.camera import lens_point
+from spadwarp_kernels.optics.port import Connection
 from spadwarp_kernels.optics.sea import FACETS, passage_density
-from spadwarp_kernels.optics.visibility import Link, lens_in_air
+from spadwarp_kernels.optics.visibility import lens_in_air
 from spadwarp_kernels.photon.queue import Request
 from spadwarp_kernels.photon.spec import TransportSpec
 from spadwarp_kernels.photon.state import SEA_FACE, SEA_SLOT, Contribution, PhotonState, World
@@ -91,13 +92,11 @@ def make_sample_flight(guide: PhaseGuide = HENYEY_GREENSTEIN_GUIDE, profile: Pro
         layers: Layers,
         begin_point: wp.vec3,
     ) -> FlightSample:
-        """A point of the flight x + s u within the interval, x relative to the lens point.
-
-        Half the points are drawn from exp(-c s), with a profile from c(s) exp(-depth(s)), half in the angle theta(s) =
-        atan2(D, t_c - s), D = |x cross u|, by which the light must turn to reach the lens: from the guide, which
-        follows the phase function; on flights that lead away from the lens (s0 >= t_c) uniformly in tan(psi/2), psi =
-        pi - theta, small far from the lens.
-        """
+        """A point of the flight x + s u within the interval, x relative to the lens point. Half the points are drawn
+        from exp(-c s), with a profile from c(s) exp(-depth(s)), half in the angle theta(s) = atan2(D, t_c - s), D = |x
+        cross u|, by which the light must turn to reach the lens: from the guide, which follows the phase function; on
+        flights that lead away from the lens (s0 >= t_c) uniformly in tan(psi/2), psi = pi - theta, small far from the
+        lens."""
         sample = FlightSample()
         s0 = interval[0]
         s1 = interval[1]
@@ -329,11 +328,9 @@ def make_flight_point(spec: TransportSpec) -> wp.Function:
 @memoised
 def make_point_of(points: int) -> wp.Function:
     """The Warp function ``(request, number) -> Request``: of a flight, that of another of its `points`, at least 2.
-
     Both random numbers of a point are a part of 1 further than those of the one before, modulo 1: those of each are
     uniform, and together they are spread evenly (systematic sampling). What a pixel's bin holds is noisy above all
-    since few flights are scored in it; the points of a flight lie in others.
-    """
+    since few flights are scored in it; the points of a flight lie in others."""
     step = wp.uint32((1 << 32) // points)
 
     @wp.func
@@ -376,7 +373,7 @@ def _make_carry(spec: TransportSpec) -> wp.Function:
     pose, sea, rider = spec.sight.pose, spec.sight.sea is not None, make_rider(spec)
 
     @wp.func
-    def carry(found: wp.ref[Scored], request: Request, link: Link, world: wp.ref[World], inside: wp.vec3):
+    def carry(found: wp.ref[Scored], request: Request, link: Connection, world: wp.ref[World], inside: wp.vec3):
         carried = request.carried
         rider.fork(carried, world)
         to_lens = pose.turn_out(world.scan, request.target, link.to_lens)
@@ -391,17 +388,15 @@ def _make_carry(spec: TransportSpec) -> wp.Function:
             rider.fly(carried, world, begin, pose.turn_out(world.scan, request.target, link.along), link.water)
         else:
             rider.fly(carried, world, found.origin, to_lens, link.water)
-        rider.deliver(found.contribution, carried, world, link.end, link.to_lens, arrives)
+        rider.deliver(found.contribution, carried, world, link.exit, link.to_lens, arrives)
 
     return carry
 
 
 @memoised
 def make_score(spec: TransportSpec, flights: bool = False) -> wp.Function:
-    """The Warp function ``(request, world) -> Scored`` of next events, with what rides along.
-
-    `flights`: whether requests may ask for a point of a flight.
-    """
+    """The Warp function ``(request, world) -> Scored`` of next events, with what rides along. `flights`: whether
+    requests may ask for a point of a flight."""
     reflects, collides, water = spec.domain.reflects, flights and spec.scores_collisions, spec.water
     flight_point, scattering_density = make_flight_point(spec), make_scattering(spec)
     sight, pose, sea, rider = spec.sight, spec.sight.pose, spec.sight.sea is not None, make_rider(spec)
@@ -438,7 +433,7 @@ def make_score(spec: TransportSpec, flights: bool = False) -> wp.Function:
         surface = sight.sea_at(world.sea, world.scan, request.target)
         link = sight.link(camera, surface, origin, lens, at_sea, bits)
         to_lens = pose.turn_out(world.scan, request.target, link.to_lens)
-        found.lens = pose.point_out(world.scan, request.target, link.end)
+        found.lens = pose.point_out(world.scan, request.target, link.exit)
         found.behind = pose.point_out(world.scan, request.target, lens)
         pixel = sight.project(world.camera, view, request.target, link.image, lens)
         scattering = scattering_density(request, found.origin, to_lens, world)

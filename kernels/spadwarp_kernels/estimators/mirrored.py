@@ -131,7 +131,7 @@ def _make_score_image(spec: TransportSpec) -> wp.Function:
         if wp.static(followed):
             seed = join_words(request.first, wp.uint32(number + 1) << wp.uint32(8))
             follow(
-                found, request, x, heading, link.water, reflections_of(image), link.end, lens - link.image, world, seed
+                found, request, x, heading, link.water, reflections_of(image), link.exit, lens - link.image, world, seed
             )
         if wp.static(measured):
             extinction = found.depth / link.water
@@ -144,10 +144,10 @@ def _make_score_image(spec: TransportSpec) -> wp.Function:
 
 
 @memoised
-def make_score_images(spec: TransportSpec, split: bool) -> wp.Function:
+def make_score_images(spec: TransportSpec) -> wp.Function:
     """The Warp function ``(s, request, world, sink)`` that scores a request's event by way of all images; a point of a
     flight is not scored so: events are."""
-    score_image, deposit = _make_score_image(spec), make_deposit(spec.signed, 0, split)
+    score_image, deposit = _make_score_image(spec), make_deposit(spec.signed, 0)
 
     @wp.func
     def score_images(s: wp.ref[PhotonState], request: Request, world: wp.ref[World], sink: wp.ref[Sink]):

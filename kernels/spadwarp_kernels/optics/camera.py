@@ -11,6 +11,7 @@ import warp as wp
 
 from spadwarp_kernels.base import check
 from spadwarp_kernels.base.check import ArgumentError
+from spadwarp_kernels.base.native import fill
 from spadwarp_kernels.base.rotations import cos_sin_turn
 
 from .port import Port
@@ -25,8 +26,7 @@ class Camera:
     width: int  # of the image [pixels]
     height: int  # of the image [pixels]
     pixel_tangent: float  # pixel pitch over image distance
-    aperture_radius: float
-    """Radius of the entrance pupil [m]; 0 makes the lens a point, which images all depths sharply."""
+    aperture_radius: float  # of the entrance pupil [m]; 0 makes the lens a point, which images all depths sharply
     aperture_area: float  # the area that collects light [m^2], also where the lens is a point
     inverse_focus: float  # 1 over the depth that is imaged sharply [1/m]; 0 is infinity
     focal: wp.vec2
@@ -154,10 +154,9 @@ def field(camera: Any) -> wp.vec4:
 def ready_camera(copy: Any, camera: Any) -> None:
     """Readies a copy for a kernel with view, focal lengths and principal point of square pixels about the axis."""
     tangent = np.float32(camera.pixel_tangent)
-    copy.view = field(camera)
     focal = float(1.0 / tangent) if tangent > 0.0 else 0.0  # 0 where nothing asks for an image
-    copy.focal = wp.vec2(focal, focal)
-    copy.principal = wp.vec2(0.5 * int(camera.width), 0.5 * int(camera.height))
+    middle = (0.5 * int(camera.width), 0.5 * int(camera.height))
+    fill(copy, view=field(camera), focal=(focal, focal), principal=middle)
 
 
 @wp.func
@@ -247,7 +246,7 @@ def make_camera(
     aperture_area: float | None = None,
     focus: float = math.inf,
 ) -> Camera:
-    """A camera whose numbers fit each other, see `Camera`.
+    """A camera whose numbers fit each other, see `Camera`. Raises `ArgumentError`.
 
     Args:
         width, height: Of the image [pixels].
@@ -255,13 +254,9 @@ def make_camera(
         aperture_radius: Of the lens [m]; 0 images all depths sharply, and needs `aperture_area`.
         aperture_area: That collects light [m^2]; by default, and within 1 % of it, that of the radius.
         focus: Depth that is imaged sharply [m].
-
-    Raises:
-        ArgumentError: A number out of range, or an area that is not that of the radius.
     """
-    camera = Camera()
-    camera.width, camera.height = check.integer("width", width, 1), check.integer("height", height, 1)
-    camera.pixel_tangent = check.number("pixel_tangent", pixel_tangent, "(0, inf)")
+    width, height = check.integer("width", width, 1), check.integer("height", height, 1)
+    pixel_tangent = check.number("pixel_tangent", pixel_tangent, "(0, inf)")
     radius = check.number("aperture_radius", aperture_radius, "[0, inf)")
     area = check.number("aperture_area", math.pi * radius**2 if aperture_area is None else aperture_area, "[0, inf)")
     if radius > 0.0 and abs(area - math.pi * radius**2) > 0.01 * math.pi * radius**2:
@@ -269,24 +264,18 @@ def make_camera(
         raise ArgumentError(f"aperture_area = {area} m^2, and {disc}; a lens of another area has aperture_radius = 0")
     if area == 0.0:
         raise ArgumentError("aperture_radius = 0 needs aperture_area [m^2]: a camera of no area sees nothing")
-    camera.aperture_radius, camera.aperture_area = radius, area
-    camera.inverse_focus = 0.0 if focus == math.inf else 1.0 / check.number("focus", focus, "(0, inf)")
-    return camera
+    inverse = 0.0 if focus == math.inf else 1.0 / check.number("focus", focus, "(0, inf)")
+    made = fill(Camera(), width=width, height=height, pixel_tangent=pixel_tangent, aperture_radius=radius)
+    return fill(made, aperture_area=area, inverse_focus=inverse)
 
 
 def make_gate(bins: int, *, one_way_metres: tuple[float, float]) -> Gate:
-    """A gate of equal bins, so many, between two distances from the camera [m].
-
-    Raises:
-        ArgumentError: A number out of range.
-    """
+    """A gate of equal bins, so many, between two distances from the camera [m]. Raises `ArgumentError`."""
     check.vector("one_way_metres", one_way_metres, size=2)
     start = check.number("one_way_metres[0]", one_way_metres[0], "[0, inf)")
     stop = check.number("one_way_metres[1]", one_way_metres[1], f"({start}, inf)")
-    gate = Gate()
-    gate.bins = check.integer("bins", bins, 1)
-    gate.start, gate.stop, gate.bins_per_metre = 2.0 * start, 2.0 * stop, gate.bins / (2.0 * (stop - start))
-    return gate
+    bins = check.integer("bins", bins, 1)
+    return fill(Gate(), start=2.0 * start, stop=2.0 * stop, bins=bins, bins_per_metre=bins / (2.0 * (stop - start)))
 
 
 BEFORE = wp.constant(-1)

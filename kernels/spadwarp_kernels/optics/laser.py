@@ -11,6 +11,7 @@ from numpy.typing import ArrayLike, NDArray
 from spadwarp_kernels.base import check
 from spadwarp_kernels.base.check import ArgumentError
 from spadwarp_kernels.base.kernels import memoised
+from spadwarp_kernels.base.native import fill
 from spadwarp_kernels.base.philox import STREAM_EMISSION, random_block, u01, u01_fine, u01_open
 from spadwarp_kernels.base.rotations import cos_sin_turn, orthonormal_basis, rotate_direction
 
@@ -51,7 +52,7 @@ def make_laser(
     position: Sequence[float] = (0.0, 0.0, 0.0),
     axis: Sequence[float] = (0.0, 0.0, 1.0),
 ) -> Laser:
-    """A laser of one of LASER_PROFILES, in camera coordinates.
+    """A laser of one of LASER_PROFILES, in camera coordinates. Raises `ArgumentError`.
 
     Args:
         profile: "uniform_cone", "gaussian" or "collimated".
@@ -59,9 +60,6 @@ def make_laser(
         radius: Of a collimated beam [m]; 0 is a pencil beam.
         position: Of its exit pupil [m].
         axis: Of the beam, of any length but 0.
-
-    Raises:
-        ArgumentError: A number out of range, or one that the profile does not have.
     """
     check.choice("profile", profile, LASER_PROFILES)
     needed, other = ("radius", half_angle) if profile == "collimated" else ("half_angle", radius)
@@ -74,16 +72,12 @@ def make_laser(
     check.vector("axis", axis)
     length = math.hypot(*axis)
     check.number("length of axis", length, "(0, inf)")
-    laser = Laser()
-    laser.position, laser.axis = wp.vec3(*position), wp.vec3(*(x / length for x in axis))
-    laser.profile = LASER_PROFILES.index(profile)
+    laser = fill(Laser(), position=position, axis=[x / length for x in axis], profile=LASER_PROFILES.index(profile))
     if profile == "collimated":
-        laser.radius = value
-    elif profile == "gaussian":
-        laser.tan2 = math.tan(value) ** 2
-    else:
-        laser.spread = 2.0 * math.sin(0.5 * min(value, math.pi)) ** 2
-    return laser
+        return fill(laser, radius=value)
+    if profile == "gaussian":
+        return fill(laser, tan2=math.tan(value) ** 2)
+    return fill(laser, spread=2.0 * math.sin(0.5 * min(value, math.pi)) ** 2)
 
 
 @wp.func
@@ -115,7 +109,7 @@ def emit_photon(laser: Laser, axis: wp.vec3, seed: wp.uint64, id: wp.uint64):
 
 
 def profile_tables(image: ArrayLike) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
-    """Distribution functions from which `emit_measured` draws a pixel of a beam profile.
+    """Distribution functions from which `emit_measured` draws a pixel of a beam profile. Raises `ArgumentError`.
 
     Args:
         image: Irradiance on a plane across the beam, `[H, W]`, any unit, >= 0, finite, not all 0.
@@ -123,9 +117,6 @@ def profile_tables(image: ArrayLike) -> tuple[NDArray[np.float32], NDArray[np.fl
     Returns:
         float32 `[H]`, the part of the power in the rows up to each; float32 `[H, W]`, the same along each row. The last
         entries are 1.
-
-    Raises:
-        ArgumentError: Another shape, or values that cannot be.
     """
     power = check.numbers("profile", image, (None, None), "[0, inf)")
     if not power.any():
@@ -207,9 +198,9 @@ def make_sun(
     height += check.number("crest", crest, "[0, inf)")
     position = (distance - height) * check.numbers("down", down, (3,))
     laser = make_laser("collimated", radius=0.0, axis=direction, position=position)
-    laser.down, laser.patch = wp.vec3(*down), wp.spatial_vector(*check.numbers("patch", patch, (2, 3)).ravel())
+    spread = check.number("sky", sky, "[0, 1]")
+    fill(laser, down=down, patch=check.numbers("patch", patch, (2, 3)).ravel(), spread=spread)
     check.number("cosine of direction to down", float(wp.dot(laser.axis, laser.down)), "(0, 1.000001]")
-    laser.spread = check.number("sky", sky, "[0, 1]")
     return laser
 
 
@@ -235,8 +226,7 @@ class Scan:
 
     count: int  # number of positions; position i is scored into pixel i, or the row i of a receiver's pixels
     axis: wp.array[wp.vec3]  # unit vector of the beam at each
-    view: wp.array[wp.vec4]
-    """Tangents (left, top, right, bottom) of what each position's pixel sees; a box that holds it."""
+    view: wp.array[wp.vec4]  # tangents (left, top, right, bottom) of a box that holds what each pixel sees
     pose: wp.array[wp.transform]
     """From the frame of camera and laser at each shot to the frame of all else. With the lens `SCANNED`, which reads
     this alone: `Laser.axis` and `Camera.view` are those of every shot."""
@@ -278,8 +268,7 @@ def make_pose(moves: bool) -> Pose:
 class Beam(NamedTuple):
     """How photons start, as Warp functions."""
 
-    emit: wp.Function
-    """``(laser, scan, seed, id) -> spatial_vector``: start [m], then unit direction, in the frame of the camera."""
+    emit: wp.Function  # ``(laser, scan, seed, id) -> spatial_vector``: start [m], unit direction; of the camera's frame
     axis: wp.Function  # ``(laser, scan, target) -> vec3``, the beam's, for a position of the scan
     port: PortKind | None  # what is between the laser and the water
     scans: bool

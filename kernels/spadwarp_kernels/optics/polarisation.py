@@ -8,6 +8,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from spadwarp_kernels.base import check
 from spadwarp_kernels.base.check import ArgumentError
+from spadwarp_kernels.base.native import fill
 
 __all__ = ["MATRIX_POINTS", "MOST_CHANNELS", "Polarisation", "make_polarisation", "matrix_cosines"]
 
@@ -29,8 +30,7 @@ class Polarisation:
     channels: Channels
     """A row for each channel of the receiver, whose product with the Stokes vector it takes; with respect to the
     image's x, so that U is light at 45 degrees from x towards y less that at 135."""
-    facet_index: wp.array(dtype=float)
-    """Index of each face's specular facets over that of the water; empty without a specular lobe."""
+    facet_index: wp.array(dtype=float)  # of each face's specular facets over the water's; empty without them
 
 
 def matrix_cosines() -> NDArray[np.float64]:
@@ -49,7 +49,7 @@ def make_polarisation(
     facet_index: ArrayLike = (),
     device: wp.DeviceLike = None,
 ) -> Polarisation:
-    """Parameters of polarised light, for `Model.polarisation`.
+    """Parameters of polarised light, for `Model.polarisation`. Raises `ArgumentError`.
 
     Args:
         laser: Stokes vector of the emitted light, I = 1, see `Polarisation`.
@@ -57,26 +57,18 @@ def make_polarisation(
             `Elements`. None: light keeps its polarisation as it is turned.
         channels: Up to MOST_CHANNELS rows of four numbers; as many as the spec has.
         facet_index: Of each face, > 0; one number for each, or nothing.
-
-    Raises:
-        ArgumentError: Numbers that no light and no matrix can have.
     """
     device = check.device("device", device)
-    polarisation = Polarisation()
     stokes = check.numbers("laser", laser, (4,), "(-inf, inf)")
     if stokes[0] != 1.0 or float(np.linalg.norm(stokes[1:])) > 1.0 + 1e-6:
         raise ArgumentError(f"laser = {laser!r} is not a Stokes vector with I = 1, polarised by 1 at most")
-    polarisation.laser = wp.vec4(*stokes.tolist())
     cosines = matrix_cosines()
     table = np.tile([0.0, 1.0, 1.0, 0.0, 1.0], (cosines.size, 1))
     if matrix is not None:
         check.kind("matrix", matrix, Callable)
         table = check.numbers("matrix(cosines)", matrix(cosines), table.shape, "[-1.000001, 1.000001]")
-    polarisation.first = wp.array(table[:, :4].astype(np.float32), dtype=wp.vec4, device=device)
-    polarisation.last = wp.array(table[:, 4].astype(np.float32), dtype=float, device=device)
     rows, count = np.zeros((MOST_CHANNELS, 4)), check.integer("channels", len(channels), 0, MOST_CHANNELS)
     rows[:count] = check.numbers("channels", channels, (count, 4) if count else (0,), "[-1, 1]").reshape(count, 4)
-    polarisation.channels = Channels(*rows.ravel().tolist())
     facets = check.numbers("facet_index", np.ravel(facet_index), (None,), "(0, inf)")
-    polarisation.facet_index = wp.array(facets.astype(np.float32), dtype=float, device=device)
-    return polarisation
+    made = fill(Polarisation(), device, laser=stokes, first=table[:, :4], last=table[:, 4])
+    return fill(made, device, channels=rows, facet_index=facets)

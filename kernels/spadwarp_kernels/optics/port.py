@@ -9,6 +9,7 @@ import warp as wp
 
 from spadwarp_kernels.base import check
 from spadwarp_kernels.base.check import ArgumentError
+from spadwarp_kernels.base.native import fill
 
 __all__ = ["DOME_PORT", "FLAT_PORT", "Port", "PortKind", "make_dome_port", "make_flat_port"]
 
@@ -39,24 +40,28 @@ class Port:
     margin: float  # bound of how far a rough surface moves a line of sight aside, over the depth below it (sea)
     amplitude: float  # bound of the height of resolved waves above the plane, and of their depth below it [m] (sea)
     straight: float  # and of how far aside light gets on its way between them, without being refracted [m] (sea)
-    early: float
-    """The way through the port takes at most this much less than the straight line in water [m of water]."""
+    early: float  # the way through the port takes at most this much less than the straight line in water [m of water]
     late: float  # and at most this much more [m of water]
 
 
 @wp.struct
 class Connection:
-    """The one way of light from a point in the water to a point inside."""
+    """The one way of light from a point in the water to a point inside, or to one of the lens."""
 
-    to_port: wp.vec3  # unit direction in the water
+    to_lens: wp.vec3  # unit direction at the point
     inside: wp.vec3  # unit direction in which it arrives
-    exit: wp.vec3  # where it leaves the water [m]
+    exit: wp.vec3  # where it leaves the water, or crosses the surface of a sea; else the point of the lens [m]
     water: float  # length of its way in the water [m]
     path: float  # length in water that takes as long as the whole way [m]
     transmission: float  # fraction of unpolarised light that gets through
     # solid angle at the point in the water over the area that its light covers inside, across the ray [sr/m^2]; 0:
     # there is no such way. 1/r^2 where all indices are equal
     density: float
+    # Of `Sight.link`:
+    image: wp.vec3  # a point that the lens sees in the direction in which it arrives, in air alone [m]
+    begin: wp.vec3  # by a sea, where its way in the water begins [m]
+    along: wp.vec3  # and the unit vector along that
+    gather: float  # by a port or a sea, what the lens gets of an intensity without extinction, per its area [sr/m^2]
 
 
 @wp.struct
@@ -310,9 +315,9 @@ def _make_ways(face: wp.Function, aim_at: wp.Function) -> tuple[wp.Function, ...
             return c
         p = enter(port, o, aim.u)
         c.inside = -aim.u
-        c.to_port = -p.u
-        c.water = face(port, x, c.to_port, True, True)[3]
-        c.exit = x + c.water * c.to_port
+        c.to_lens = -p.u
+        c.water = face(port, x, c.to_lens, True, True)[3]
+        c.exit = x + c.water * c.to_lens
         c.path = c.water + p.path
         c.transmission = p.transmission
         c.density = aim.density
@@ -332,7 +337,7 @@ def _make_ways(face: wp.Function, aim_at: wp.Function) -> tuple[wp.Function, ...
 def _apparent_flat(port: Port, x: wp.vec3, o: wp.vec3, c: Connection) -> wp.vec3:
     """Where the ray of a connection from x to o meets the port's axis through o."""
     n = port.index
-    q_water = -n[2] * wp.dot(c.to_port, port.normal)
+    q_water = -n[2] * wp.dot(c.to_lens, port.normal)
     q_inside = -n[0] * wp.dot(c.inside, port.normal)
     q_glass = wp.sqrt(n[1] * n[1] - n[0] * n[0] + q_inside * q_inside)
     inside = port.distance - wp.dot(o, port.normal)
@@ -352,7 +357,7 @@ def apparent_centre(port: Port) -> wp.vec3:
 @wp.func
 def _apparent_dome(port: Port, x: wp.vec3, o: wp.vec3, c: Connection) -> wp.vec3:
     """The point of the ray of a connection from x to o that is nearest to o."""
-    return x + wp.dot(o - x, c.to_port) * c.to_port
+    return x + wp.dot(o - x, c.to_lens) * c.to_lens
 
 
 # ---- Kinds of ports, as the transport kernels take them, and their parameters from lengths and indices.
@@ -374,8 +379,7 @@ class PortKind(NamedTuple):
     cosines: wp.Function
     """Warp function (port, x, u) -> vec4, `PortRay.cosines` of the ray through x in the water along u, on its way in or
     out."""
-    apparent: wp.Function
-    """Warp function (port, x, o, connection) -> the point from where the light of o seems to come at x [m]."""
+    apparent: wp.Function  # (port, x, o, connection) -> the point from where the light of o seems to come at x [m]
 
 
 FLAT_PORT = PortKind("flat", *_make_ways(_plane_face, _aim_flat), _apparent_flat)
@@ -397,7 +401,7 @@ def make_flat_port(
     largest_angle: float = 1.5,
     sea: Any = None,
 ) -> Port:
-    """The parameters of a plane window.
+    """The parameters of a plane window. Raises `ArgumentError`.
 
     Args:
         distance: From the camera's lens centre along the normal to the inner face [m].
@@ -409,9 +413,6 @@ def make_flat_port(
         largest_angle: Between the normal and any ray of the view, inside, in [0, pi/2) [rad].
         sea: The surface of a sea, see `make_sea`, if the port is its mean plane; all of the lens must be farther away
             than its waves are high.
-
-    Raises:
-        ArgumentError: A number out of its range.
     """
     check.number("distance", distance, "(-inf, inf)")
     check.vector("normal", normal, unit=True)
@@ -427,10 +428,9 @@ def make_flat_port(
             f"distance = {distance} m: a lens or laser at {tuple(origin)} m of radius {aperture_radius} m reaches "
             f"through the port{waves}"
         )
-    port.normal, port.distance = wp.vec3(*normal), distance
     n = tuple(port.index)
     slopes = [_slopes(n[0], n[k], largest_angle) for k in (1, 2)]
-    port.glass_slope, port.water_slope = (wp.vec2(*bounds) for bounds in slopes)
+    fill(port, normal=normal, distance=distance, glass_slope=slopes[0], water_slope=slopes[1])
     tangent = max(1.0, slopes[0][1]) * math.tan(largest_angle)  # the largest inside and in the window
     longest = min(math.hypot(1.0, tangent), _FAR)
     _set_times(port, ((inside - tilt, (inside + tilt) * longest), (thickness, thickness * longest)))
@@ -473,8 +473,7 @@ def make_dome_port(
     check.number("radius", radius, "(0, 1e9]")
     check.vector("centre", centre)
     port = _port(thickness, index, group_index, origin, aperture_radius, largest_angle)
-    port.radius, port.centre = radius, wp.vec3(*centre)
-    n = tuple(port.index)
+    n = tuple(fill(port, radius=radius, centre=centre).index)
     furthest = math.dist(centre, origin) + aperture_radius
     if not furthest < min(1.0, n[1] / n[0], n[2] / n[0] * (1.0 + thickness / radius)) * radius:
         raise ArgumentError(
@@ -515,12 +514,10 @@ def _port(
         for k, value in enumerate(values):
             check.number(f"{name}[{k}]", value, "[1, inf)")
     check.number("largest_angle", largest_angle, "[0, 1.5707963]")
-    port = Port()
-    port.thickness = thickness
     # A window without thickness has no faces, and must not be the layer of the least index.
-    port.index = wp.vec3(index[0], index[1] if thickness > 0.0 else index[0], index[2])
-    port.delay = wp.vec2(group_index[0] / group_index[2], group_index[1] / group_index[2])
-    return port
+    index = (index[0], index[1] if thickness > 0.0 else index[0], index[2])
+    delay = (group_index[0] / group_index[2], group_index[1] / group_index[2])
+    return fill(Port(), thickness=thickness, index=index, delay=delay)
 
 
 def _slopes(inside: float, layer: float, angle: float) -> tuple[float, float]:

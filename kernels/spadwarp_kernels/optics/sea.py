@@ -16,6 +16,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from spadwarp_kernels.base import check
 from spadwarp_kernels.base.check import ArgumentError
+from spadwarp_kernels.base.native import fill
 from spadwarp_kernels.base.philox import begin_sequence, sequence_word, step_sequence, u01, u01_fine, u01_open
 from spadwarp_kernels.base.rotations import cos_sin_turn
 from spadwarp_kernels.water.limits import fresnel_reflectance
@@ -398,7 +399,7 @@ def _draw_point(
     surface, `behind` m before the end of the way, from a distribution of slopes: a slope moves it, to first order, by
     the slope over J in the plane of incidence and across it."""
     n = port.index
-    cos_x = -wp.dot(flat.to_port, port.normal)
+    cos_x = -wp.dot(flat.to_lens, port.normal)
     cos_o = -wp.dot(flat.inside, port.normal)
     gap = wp.abs(n[2] * cos_x - n[0] * cos_o)
     across_j = (n[2] / flat.water + n[0] / behind) / gap
@@ -410,7 +411,7 @@ def _draw_point(
     state = step_sequence(state)
     turn = cos_sin_turn(u01(sequence_word(state)))
     slope = (r * width[0] * turn[0]) * along + (r * width[1] * turn[1]) * wp.cross(up, along)
-    plane = flat.to_port + cos_x * port.normal  # along the plane of incidence
+    plane = flat.to_lens + cos_x * port.normal  # along the plane of incidence
     length = wp.length(plane)
     plane = wp.where(length > 1.0e-6, plane / wp.max(length, 1.0e-6), along)
     across = wp.cross(port.normal, plane)
@@ -459,8 +460,8 @@ def _make_connect(waves: bool) -> wp.Function:
             far = not near
             if far:
                 # And from there on to the height of the waves: about, for a lens that is much farther than x.
-                across = c.to_port + wp.dot(-c.to_port, port.normal) * port.normal
-                lower = side * facet_at(sea.waves, c.exit).height / wp.max(-wp.dot(c.to_port, port.normal), 0.1)
+                across = c.to_lens + wp.dot(-c.to_lens, port.normal) * port.normal
+                lower = side * facet_at(sea.waves, c.exit).height / wp.max(-wp.dot(c.to_lens, port.normal), 0.1)
                 c.exit -= lower * across
                 c.water -= wp.min(lower, 0.5 * c.water)
         drawn = _draw_point(port, c, wp.length(o - c.exit), sea.normal, sea.spread_along, sea.spread, seed)
@@ -475,15 +476,15 @@ def _make_connect(waves: bool) -> wp.Function:
         behind = wp.length(to_o)
         c.exit = s
         c.water = wp.length(to_s)
-        c.to_port = to_s / c.water
+        c.to_lens = to_s / c.water
         c.inside = to_o / behind
         c.transmission = 1.0
         c.density = 0.0
-        cosine = wp.dot(c.to_port, local.normal)
+        cosine = wp.dot(c.to_lens, local.normal)
         # Facets that turn their backs on x or on o let nothing through.
         if (cosine > 0.0) == below and (wp.dot(c.inside, local.normal) > 0.0) == below:
             area = c.water * c.water * behind * behind * wp.dot(local.normal, sea.normal)
-            density = passage_density(local, c.to_port, c.inside)
+            density = passage_density(local, c.to_lens, c.inside)
             c.density = density * wp.abs(cosine) / (area * wp.max(drawn[3], 1.0e-30))
         return c
 
@@ -583,10 +584,8 @@ def unresolved_covariance(
     variances: Sequence[float], along: Sequence[float], heights: ArrayLike, size: Sequence[float]
 ) -> NDArray[np.float64]:
     """Covariance of the slopes that a height field leaves to facets, along its rows and from row to row, `[2, 2]`.
-
     `along`: the wind's direction along both, of any length; else as in `make_sea`. Raises `ArgumentError` where less
-    than a tenth of the variance on an axis is left.
-    """
+    than a tenth of the variance on an axis is left."""
     resolved = facet_covariance(heights, size)
     wind = np.array(along, np.float64) / math.hypot(*along)
     turn = np.array([wind, [-wind[1], wind[0]]])
@@ -616,7 +615,7 @@ def make_sea(
     origin: Sequence[float] = (0.0, 0.0, 0.0),
     device: wp.DeviceLike = None,
 ) -> Sea:
-    """The surface of the sea.
+    """The surface of the sea. Raises `ArgumentError`.
 
     Args:
         variances: Of all slopes along and across the wind, see `slope_variances`; both 0 for a flat surface.
@@ -632,9 +631,6 @@ def make_sea(
         columns: Direction along a row, of any length, not along the normal; default: that of the wind.
         origin: A point above or below the first node [m].
         device: Where the heights are stored.
-
-    Raises:
-        ArgumentError: A number out of its range.
     """
     check.vector("variances", variances, size=2)
     for k, variance in enumerate(variances):
@@ -646,24 +642,20 @@ def make_sea(
     check.number("delay", delay, "(0, 4]")
     up = np.array(normal, np.float64)
     wind = _level("along", np.eye(3)[np.argmin(np.abs(up))] if along is None else along, up)
-    sea = Sea()
-    sea.normal, sea.height, sea.along = wp.vec3(*normal), height, wp.vec3(*wind)
-    sea.slope = wp.vec2(*(math.sqrt(2.0 * variance) for variance in variances))
-    sea.index, sea.delay, sea.extinction = index, delay, extinction
-    sea.spread_along, sea.spread = sea.along, sea.slope
+    width = [math.sqrt(2.0 * variance) for variance in variances]
+    sea = fill(Sea(), normal=normal, height=height, along=wind, slope=width, spread_along=wind, spread=width)
+    fill(sea, index=index, delay=delay, extinction=extinction)
     if heights is not None:
         check.vector("origin", origin)
         first = wind if columns is None else _level("columns", columns, up)
         second = np.cross(up, first)
-        sea.waves = _make_waves(heights, size, device)
         rest = unresolved_covariance(variances, (wind @ first, wind @ second), heights, size)
         values, vectors = np.linalg.eigh(rest)
         place = np.array(origin, np.float64)
         place += (height - place @ up) * up
-        sea.waves.normal, sea.waves.origin = sea.normal, wp.vec3(*place)
-        sea.waves.columns, sea.waves.rows = wp.vec3(*first), wp.vec3(*second)
-        sea.along = wp.vec3(*(vectors[0, 1] * first + vectors[1, 1] * second))
-        sea.slope = wp.vec2(math.sqrt(2.0 * values[1]), math.sqrt(2.0 * values[0]))
+        waves = fill(_make_waves(heights, size, device), normal=normal, origin=place, columns=first, rows=second)
+        steep = (math.sqrt(2.0 * values[1]), math.sqrt(2.0 * values[0]))
+        fill(sea, waves=waves, along=vectors[0, 1] * first + vectors[1, 1] * second, slope=steep)
     return sea
 
 
@@ -679,15 +671,11 @@ def _level(name: str, vector: ArrayLike, up: NDArray[np.float64]) -> NDArray[np.
 def _make_waves(heights: ArrayLike, size: Sequence[float], device: wp.DeviceLike) -> Waves:
     """A height field that is still to be placed."""
     h = _checked(heights, size)
-    waves = Waves()
-    waves.heights = wp.array(h.astype(np.float32), dtype=float, device=device)
-    waves.cell = wp.vec2(size[0] / h.shape[1], size[1] / h.shape[0])
-    margin = 0.01 * float(np.ptp(h)) + 1e-4
-    waves.low, waves.high = float(h.min()) - margin, float(h.max()) + margin
+    cell, margin = (size[0] / h.shape[1], size[1] / h.shape[0]), 0.01 * float(np.ptp(h)) + 1e-4
+    bounds = {"low": float(h.min()) - margin, "high": float(h.max()) + margin}
     # Slopes are bilinear in a cell's corners: the largest are at its corners.
     along, across = (np.maximum(np.abs(p), np.abs(q)) for p, q in _edges(h, size))
-    waves.steepest = float(np.hypot(along, across).max())
-    return waves
+    return fill(Waves(), device, heights=h, cell=cell, **bounds, steepest=float(np.hypot(along, across).max()))
 
 
 def _checked(heights: ArrayLike, size: Sequence[float]) -> NDArray[np.float64]:

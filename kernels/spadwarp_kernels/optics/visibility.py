@@ -10,8 +10,8 @@ from spadwarp_kernels.base.rotations import cos_sin_turn
 
 from .camera import SCANNED, Camera, Gate, Lens, check_camera, clip_half_space, clip_to_view, field, lens_point
 from .laser import Pose, Scan, make_pose
-from .port import DOME_PORT, FLAT_PORT, Port, PortKind, PortRay, apparent_centre
-from .sea import WAVES, Sea, SeaKind
+from .port import DOME_PORT, FLAT_PORT, Connection, Port, PortKind, PortRay, apparent_centre
+from .sea import FACETS, WAVES, Sea, SeaKind
 
 __all__ = ["next_event_value"]
 
@@ -75,11 +75,9 @@ def _near_depth_kernel(camera: Camera, view: wp.vec4, mesh: wp.uint64, threads: 
 
 def near_depth_map(mesh: wp.Mesh, camera: Camera, near_depth: wp.array | None = None) -> wp.array:
     """Least depth [m] at which a face of the mesh can stand in each part of the view, float32 [rows, columns], anew or
-    in place; raises `ArgumentError` for a camera that images nothing.
-
-    A point of the view that lies before it is seen from everywhere on the lens: the segments to the lens stay within
-    the texel's cone, up to what the outlines of faces are widened by, and before every face in it.
-    """
+    in place; raises `ArgumentError` for a camera that images nothing. A point of the view that lies before it is seen
+    from everywhere on the lens: the segments to the lens stay within the texel's cone, up to what the outlines of faces
+    are widened by, and before every face in it."""
     check.kind("mesh", mesh, wp.Mesh)
     check_camera("camera", camera, calibrated=False)
     shape = (int(_TEXELS), int(_TEXELS))
@@ -214,21 +212,6 @@ def dome_view_shows(camera: Camera, view: wp.vec4, x: wp.vec3) -> bool:
 # ---- The way of light from a point that is scored to a point of the lens, in water alone or through a port.
 
 
-@wp.struct
-class Link:
-    """A way to the lens."""
-
-    to_lens: wp.vec3  # unit direction at the point
-    image: wp.vec3  # a point that the lens sees in the same direction, in air alone [m]
-    end: wp.vec3  # where the way leaves the water, or crosses the surface of a sea; else the point of the lens [m]
-    water: float  # its length in the water [m]
-    begin: wp.vec3  # by a sea, where its way in the water begins [m]
-    along: wp.vec3  # and the unit vector along that
-    path: float  # length in water that takes as long as all of it [m]
-    # what the lens gets of an intensity in that direction, without extinction, per area of the lens [sr/m^2]; by a port
-    gather: float
-
-
 @wp.func
 def next_event_value(
     camera: Camera, extinction: float, weight: float, scattering: float, to_lens: wp.vec3, distance: float
@@ -252,12 +235,9 @@ class LensSample:
 @memoised
 def make_sample_lens(port: PortKind | None) -> wp.Function:
     """The Warp function ``(camera, x, u, xi1, xi2) -> LensSample``: a point of the lens by which the flight x + s u is
-    scored.
-
-    The score goes with 1/D, D its distance from the flight's line. Where this, refracted by a port, passes the lens,
-    the point is drawn with that density, uniform in angle and distance about the place: even draws would have no finite
-    variance. Else it is even.
-    """
+    scored. The score goes with 1/D, D its distance from the flight's line. Where this, refracted by a port, passes the
+    lens, the point is drawn with that density, uniform in angle and distance about the place: even draws would have no
+    finite variance. Else it is even."""
     has_port, leave = port is not None, (port or FLAT_PORT).leave
 
     @wp.func
@@ -286,12 +266,6 @@ def make_sample_lens(port: PortKind | None) -> wp.Function:
     return sample_lens
 
 
-@wp.func
-def _may_hide_anywhere(view: wp.vec4, near_depth: wp.array2d[float], x: wp.vec3) -> bool:
-    """True: the map is of straight lines to a lens that stands still."""
-    return True
-
-
 class Sight(NamedTuple):
     """How the lens sees the water, as Warp functions: x and u are of the water, o is a point of the lens; in the frame
     of the camera, see `pose`."""
@@ -304,10 +278,10 @@ class Sight(NamedTuple):
     clip: wp.Function  # as `clip_to_view`, holding the part of a flight that lies in the view
     shows: wp.Function  # as `in_view`
     gate: wp.Function  # ``(camera, gate) -> Gate`` of `clip_to_gate`, for what arrives within the gate
-    may_hide: wp.Function  # as `may_be_hidden`
+    may_hide: wp.Function  # as `may_be_hidden`, of straight lines to a lens that stands still; else True
     leave: wp.Function  # ``(camera, x, u) -> PortRay``, see `PortKind`; without a port straight on
-    # ``(camera, sea, x, o, at_sea, seed) -> Link``; `at_sea`: x is a point of the sea's surface; `seed`: 64 random bits
-    # for a sea
+    # ``(camera, sea, x, o, at_sea, seed) -> Connection``; `at_sea`: x is a point of the surface of a sea; `seed`: 64
+    # random bits for a sea
     link: wp.Function
     value: wp.Function  # ``(camera, extinction, weight, scattering, link) -> float``, part of the photon that arrives
     apparent: wp.Function  # ``(camera, x, o) -> vec3``, from where the light of o seems to come at x
@@ -336,12 +310,6 @@ def _lies_across(camera: Camera, x: wp.vec3) -> bool:
     return wp.dot(x, camera.port.normal) > camera.port.distance
 
 
-@wp.func
-def _lies_in_water(camera: Camera, x: wp.vec3) -> bool:
-    """As `_lies_across` with a port, which is between all that is scored and the lens."""
-    return True
-
-
 @memoised
 def _make_link(port: PortKind | None) -> tuple[wp.Function, wp.Function]:
     """`leave` and `link` of a `Sight` without a sea."""
@@ -363,22 +331,18 @@ def _make_link(port: PortKind | None) -> tuple[wp.Function, wp.Function]:
         return ray
 
     @wp.func
-    def link_to(camera: Camera, sea: Sea, x: wp.vec3, o: wp.vec3, at_sea: bool, seed: wp.uint64) -> Link:
-        link = Link()
+    def link_to(camera: Camera, sea: Sea, x: wp.vec3, o: wp.vec3, at_sea: bool, seed: wp.uint64) -> Connection:
+        link = Connection()
         if wp.static(has_port):
-            way = connect(camera.port, x, o)
-            link.to_lens = way.to_port
-            link.image = o - way.inside
-            link.end = way.exit
-            link.water = way.water
-            link.path = way.path
-            link.gather = way.transmission * way.density * wp.max(-way.inside[2], 0.0)
+            link = connect(camera.port, x, o)
+            link.image = o - link.inside
+            link.gather = link.transmission * link.density * wp.max(-link.inside[2], 0.0)
         else:
             to_lens = o - x
             r = wp.length(to_lens)
             link.to_lens = to_lens / r
             link.image = x
-            link.end = o
+            link.exit = o
             link.water = r
             link.path = r
         return link
@@ -389,11 +353,11 @@ def _make_link(port: PortKind | None) -> tuple[wp.Function, wp.Function]:
 @memoised
 def _make_ways(port: PortKind | None, sea: SeaKind | None) -> tuple[wp.Function, ...]:
     """What `Sight` has from `value` to `toward_centre`."""
-    bends, is_bent = port is not None or sea is not None, _lies_across if sea else _lies_in_water
+    bends, by_sea = port is not None or sea is not None, sea is not None
     connect, apparent_of = (port or FLAT_PORT).connect, (port or FLAT_PORT).apparent
 
     @wp.func
-    def value_of(camera: Camera, extinction: float, weight: float, scattering: float, link: Link) -> float:
+    def value_of(camera: Camera, extinction: float, weight: float, scattering: float, link: Connection) -> float:
         if wp.static(bends):
             return weight * scattering * wp.exp(-extinction * link.water) * camera.aperture_area * link.gather
         return next_event_value(camera, extinction, weight, scattering, link.to_lens, link.water)
@@ -401,30 +365,24 @@ def _make_ways(port: PortKind | None, sea: SeaKind | None) -> tuple[wp.Function,
     @wp.func
     def apparent(camera: Camera, x: wp.vec3, o: wp.vec3) -> wp.vec3:
         seen = wp.vec3(o)
-        if wp.static(bends):
-            bent = is_bent(camera, x)
-            if bent:
-                way = connect(camera.port, x, o)
-                if way.density > 0.0:
-                    seen = apparent_of(camera.port, x, o, way)
+        if wp.static(bends) and (wp.static(not by_sea) or _lies_across(camera, x)):
+            way = connect(camera.port, x, o)
+            if way.density > 0.0:
+                seen = apparent_of(camera.port, x, o, way)
         return seen
 
     @wp.func
     def toward(camera: Camera, x: wp.vec3, o: wp.vec3) -> wp.vec3:
         straight = wp.normalize(o - x)
-        if wp.static(bends):
-            bent = is_bent(camera, x)
-            if bent:
-                way = connect(camera.port, x, o)
-                straight = wp.where(way.density > 0.0, way.to_port, straight)
+        if wp.static(bends) and (wp.static(not by_sea) or _lies_across(camera, x)):
+            way = connect(camera.port, x, o)
+            straight = wp.where(way.density > 0.0, way.to_lens, straight)
         return straight
 
     @wp.func
     def toward_centre(camera: Camera, x: wp.vec3) -> wp.vec3:
-        if wp.static(bends):
-            bent = is_bent(camera, x)
-            if bent:
-                return wp.normalize(apparent_centre(camera.port) - x)
+        if wp.static(bends) and (wp.static(not by_sea) or _lies_across(camera, x)):
+            return wp.normalize(apparent_centre(camera.port) - x)
         return (-1.0 / wp.max(wp.length(x), 1.0e-30)) * x
 
     return value_of, apparent, toward, toward_centre
@@ -439,27 +397,25 @@ def _make_sea_link(sea: SeaKind) -> wp.Function:
     connect, is_above = sea.connect, sea.is_above
 
     @wp.func
-    def link_to(camera: Camera, sea: Sea, x: wp.vec3, o: wp.vec3, at_sea: bool, seed: wp.uint64) -> Link:
-        link = Link()
+    def link_to(camera: Camera, sea: Sea, x: wp.vec3, o: wp.vec3, at_sea: bool, seed: wp.uint64) -> Connection:
+        link = Connection()
         in_air = lens_in_air(camera)
         air = float(0.0)
         if not at_sea and is_above(sea, x) != in_air:
-            way = connect(sea, camera.port, x, o, seed)
-            rest = wp.length(o - way.exit)
-            link.to_lens = way.to_port
-            link.image = o - way.inside
-            link.end = way.exit
-            link.begin = wp.where(in_air, x, way.exit)
-            link.along = wp.where(in_air, way.to_port, way.inside)
-            link.water = wp.where(in_air, way.water, rest)
-            air = wp.where(in_air, rest, way.water)
-            link.gather = way.transmission * way.density * wp.max(-way.inside[2], 0.0)
+            link = connect(sea, camera.port, x, o, seed)
+            rest = wp.length(o - link.exit)
+            link.image = o - link.inside
+            link.begin = wp.where(in_air, x, link.exit)
+            link.along = wp.where(in_air, link.to_lens, link.inside)
+            air = wp.where(in_air, rest, link.water)
+            link.water = wp.where(in_air, link.water, rest)
+            link.gather = link.transmission * link.density * wp.max(-link.inside[2], 0.0)
         else:
             to_lens = o - x
             r = wp.length(to_lens)
             link.to_lens = to_lens / r
             link.image = x
-            link.end = o
+            link.exit = o
             link.begin = x
             link.along = link.to_lens
             link.water = wp.where(in_air, 0.0, r)
@@ -472,29 +428,26 @@ def _make_sea_link(sea: SeaKind) -> wp.Function:
     return link_to
 
 
-@wp.func
-def _always_clear(camera: Camera, sea: Sea, x: wp.vec3, o: wp.vec3, link: Link) -> bool:
-    return True
-
-
 @memoised
-def _make_clear(sea: SeaKind) -> wp.Function:
+def _make_clear(sea: SeaKind, waves: bool) -> wp.Function:
     """See `Sight.clear`. A way by the surface is followed from there to both ends: to the surface it would end there by
     rounding, or not."""
     distance = sea.distance
 
     @wp.func
-    def clear(camera: Camera, sea: Sea, x: wp.vec3, o: wp.vec3, link: Link) -> bool:
+    def clear(camera: Camera, sea: Sea, x: wp.vec3, o: wp.vec3, link: Connection) -> bool:
+        if wp.static(not waves):
+            return True
         if link.gather <= 0.0:
             return False
         in_air = lens_in_air(camera)
-        rest = o - link.end
+        rest = o - link.exit
         length = wp.length(rest)
         if length > 0.0:
-            back = link.end - x
+            back = link.exit - x
             way = wp.length(back)
-            free = distance(sea, link.end, -link.to_lens, not in_air, way) > way
-            return free and distance(sea, link.end, rest / length, in_air, length) > length
+            free = distance(sea, link.exit, -link.to_lens, not in_air, way) > way
+            return free and distance(sea, link.exit, rest / length, in_air, length) > length
         way = wp.length(o - x)
         return distance(sea, x, link.to_lens, in_air, way) > way
 
@@ -586,12 +539,15 @@ def make_sight(lens: Lens, port: PortKind | None, confocal: bool, sea: SeaKind |
             wide.stop = gate.stop + camera.port.early
         return wide
 
+    @wp.func
+    def may_hide(view: wp.vec4, near_depth: wp.array2d[float], x: wp.vec3) -> bool:
+        return wp.static(bends or moves) or may_be_hidden(view, near_depth, x)
+
     leave, link = _make_link(port)
     ways = (leave, _make_sea_link(sea) if sea else link, *_make_ways(port, sea))
     view = _make_sea_view(lens.shows) if sea else _VIEWS[port.name] if port else (clip_to_view, lens.shows)
-    may_hide = _may_hide_anywhere if bends or moves else may_be_hidden
     imaging = (lens.project, lens.view, lens.toward_middle, scan_view)
     pose = make_pose(moves)
     placed = _make_placed(pose, moves and sea is not None, waves)
-    clear = _make_clear(sea) if sea and waves else _always_clear
+    clear = _make_clear(sea or FACETS, waves)
     return Sight(port, *imaging, *view, gate_of, may_hide, *ways, make_sample_lens(port), pose, *placed, sea, clear)

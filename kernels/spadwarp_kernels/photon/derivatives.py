@@ -12,6 +12,7 @@ import warp as wp
 
 from spadwarp_kernels.base import check
 from spadwarp_kernels.base.check import ArgumentError
+from spadwarp_kernels.base.native import fill
 from spadwarp_kernels.water.medium import MOST_CONSTITUENTS, Grid
 
 __all__ = ["BLOCK_DERIVATIVES", "DERIVATIVES", "MOST_BLOCK_DERIVATIVES", "MOST_DERIVATIVES", "Blocks", "Derivatives"]
@@ -104,30 +105,22 @@ def make_derivatives(
     both = (count if "concentration" in kinds else None,)
     extinction = check.numbers("extinction", extinction, both, "[0, inf)")
     rows = check.numbers("constituent", constituent, extinction.shape, f"[0, {MOST_CONSTITUENTS - 1}]", whole=True)
-    derivatives = Derivatives()
-    for p, (one, row) in enumerate(zip(extinction, rows, strict=True)):
-        derivatives.extinction[p], derivatives.constituent[p] = one, int(row)
-    derivatives.value = LogDerivatives(*value, *[0.0] * (MOST_DERIVATIVES - count))
-    derivatives.scale = LogDerivatives(*scale, *[0.0] * (MOST_DERIVATIVES - tallies))
+    numbers = {"value": value, "scale": scale, "extinction": extinction, "constituent": rows.astype(int)}
+    padded = {name: np.pad(row, (0, MOST_DERIVATIVES - len(row))) for name, row in numbers.items()}
+    derivatives = fill(Derivatives(), **padded)
     for name, parts in (("waters", waters), ("faces", faces)):
         whole = check.numbers(name, parts, (None,), "[-2147483648, 2147483647]", whole=True).astype(np.int32)
-        setattr(derivatives, name, wp.array(whole, dtype=int, device=device, shape=whole.size))
-    if blocks is not None:
-        check.kind("blocks", blocks, Blocks)
-        derivatives.blocks = blocks
-    return derivatives
+        fill(derivatives, device, **{name: whole})
+    return derivatives if blocks is None else fill(derivatives, blocks=check.kind("blocks", blocks, Blocks))
 
 
 def make_blocks(grid: Grid, shape: Sequence[int], scale: Sequence[float]) -> Blocks:
-    """The cells of a grid in blocks of equally many.
+    """The cells of a grid in blocks of equally many. Raises `ArgumentError`.
 
     Args:
         grid: From `make_grid`.
         shape: Number of blocks along the three edges; each divides the number of cells there.
         scale: Tally units of the derivative per emitted photon, by kind in `TransportSpec.blocks`.
-
-    Raises:
-        ArgumentError: A number that does not divide that of the cells, or is out of range; too many derivatives.
     """
     check.kind("grid", grid, Grid)
     shape, scale = check.items("shape", shape), check.items("scale", scale)
@@ -140,16 +133,12 @@ def make_blocks(grid: Grid, shape: Sequence[int], scale: Sequence[float]) -> Blo
             raise ArgumentError(
                 f"blocks[{edge}] = {blocks} does not divide {cells}, the number of cells along that edge"
             )
-    made = Blocks()
-    made.count = shape[0] * shape[1] * shape[2]
-    check.integer("number of derivatives by block", kinds * made.count, 1, MOST_BLOCK_DERIVATIVES)
-    made.kinds = kinds
-    made.scale = wp.vec3(*scale, *[0.0] * (3 - kinds))
+    count = shape[0] * shape[1] * shape[2]
+    check.integer("number of derivatives by block", kinds * count, 1, MOST_BLOCK_DERIVATIVES)
     factor = np.array(shape) / np.array(list(grid.size))
-    made.grid.turn = wp.mat33(*(factor[:, None] * np.array(grid.turn).reshape(3, 3)).ravel().tolist())
-    made.grid.shift = wp.vec3(*(factor * np.array(grid.shift)).tolist())
-    made.grid.size = wp.vec3i(*shape)
-    return made
+    turn, shift = factor[:, None] * np.array(grid.turn).reshape(3, 3), factor * np.array(grid.shift)
+    blocks_as_cells = fill(Grid(), turn=turn, shift=shift, size=shape)
+    return fill(Blocks(), grid=blocks_as_cells, count=count, kinds=kinds, scale=[*scale, *[0.0] * (3 - kinds)])
 
 
 # ---- What a thread remembers of the blocks, see `Blocks.memory`.

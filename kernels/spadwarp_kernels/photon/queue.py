@@ -4,7 +4,6 @@ import warp as wp
 
 from spadwarp_kernels.base.kernels import memoised
 from spadwarp_kernels.base.native import bits_of, from_bits
-from spadwarp_kernels.tally.tally import BACKSCATTER
 
 from .spec import TransportSpec
 from .state import Carried, PhotonRef, SinkRef, WorldRef
@@ -148,23 +147,6 @@ def queue_vector(memory: int, put: bool, entry: int, value: wp.vec4) -> wp.vec4:
     ...
 
 
-@wp.func_native(f"""
-#if defined(__CUDA_ARCH__)
-    float4* mine = static_cast<float4*>(__cvta_shared_to_generic(static_cast<unsigned int>(memory))) + {_QUEUE} + begin;
-    float2* pairs = reinterpret_cast<float2*>(mine);
-    if (put) pairs[entry] = make_float2(value[0], value[1]);
-    const float2 held = pairs[entry];
-    return wp::vec2(held.x, held.y);
-#else
-    return value;
-#endif
-""")
-def queue_pair(memory: int, put: bool, begin: int, entry: int, value: wp.vec2) -> wp.vec2:
-    """Writes or reads one of the pairs of numbers that the warp's queue has where its vectors from `begin` on would be;
-    CUDA alone."""
-    ...
-
-
 ADD_ENTRY, READ_SIZE, SET_SIZE = (wp.constant(i) for i in range(3))
 
 
@@ -184,11 +166,9 @@ ADD_ENTRY, READ_SIZE, SET_SIZE = (wp.constant(i) for i in range(3))
     return number;
 """)
 def queue_size(memory: int, act: int, number: int) -> int:
-    """The number of entries of the warp's queue; CUDA alone.
-
-    ADD_ENTRY: any lane adds one and gets its index. READ_SIZE: all lanes together read the size, after which they see
-    what the entries hold. SET_SIZE: all lanes together set it to a number.
-    """
+    """The number of entries of the warp's queue; CUDA alone. ADD_ENTRY: any lane adds one and gets its index.
+    READ_SIZE: all lanes together read the size, after which they see what the entries hold. SET_SIZE: all lanes
+    together set it to a number."""
     ...
 
 
@@ -217,65 +197,11 @@ def _size(spec: TransportSpec, flights: bool, long: bool) -> tuple[int, int]:
 
 def long_queue_fits(spec: TransportSpec, in_tree: bool) -> bool:
     """Whether a block's shared memory holds a `long` queue of flights and, `in_tree`, leaves the cache enough for the
-    walk down the tree.
-
-    Not in grids: with 72 registers the longer queues of all warps would leave 28 kB of cache, in place of 92 kB.
-    """
+    walk down the tree. Not in grids: with 72 registers the longer queues of all warps would leave 28 kB of cache, in
+    place of 92 kB."""
     entries, vectors = _size(spec, True, True)
     kib = _KIB_IN_TREE if in_tree else 48
     return spec.grid is None and 16 * (_QUEUE + vectors * entries) * BLOCK_SIZE // 32 <= kib * 1024
-
-
-def _make_words(spec: TransportSpec, more: bool, begin: int) -> tuple[wp.Function, wp.Function]:
-    """Two Warp functions that write, ``(memory, entry, request)``, and read, ``(memory, entry, request) -> Request``,
-    what a request has beside x, u, weight and path: a vector from `begin` on, or a pair where requests are of
-    scatterings in water alone, which need one random word beside that of the tally. `more`: see `_has_more`."""
-    confocal = spec.confocal
-    short = not (spec.mesh or more or spec.derivatives or spec.polarised or spec.lines or spec.grid or spec.sea)
-
-    @wp.func
-    def write_pair(memory: int, entry: int, request: Request):
-        words = wp.vec2(from_bits(int(request.first)), from_bits(int(request.rounding_sample)))
-        queue_pair(memory, True, wp.static(begin), entry, words)
-
-    @wp.func
-    def read_pair(memory: int, entry: int, request: Request) -> Request:
-        words = queue_pair(memory, False, wp.static(begin), entry, wp.vec2())
-        request.first = wp.uint32(bits_of(words[0]))
-        request.rounding_sample = wp.uint32(bits_of(words[1]))
-        request.component = BACKSCATTER
-        request.target = -1
-        request.slot = -1
-        return request
-
-    @wp.func
-    def write_vector(memory: int, entry: int, request: Request):
-        packed = request.component + int(request.rounding_sample & _UPPER_24)
-        queue_vector(
-            memory,
-            True,
-            entry + wp.static(begin),
-            wp.vec4(
-                from_bits(int(request.first)),
-                from_bits(int(request.second)),
-                from_bits(packed),
-                from_bits(wp.where(wp.static(confocal), request.target, request.slot)),
-            ),
-        )
-
-    @wp.func
-    def read_vector(memory: int, entry: int, request: Request) -> Request:
-        c = queue_vector(memory, False, entry + wp.static(begin), wp.vec4())
-        request.first = wp.uint32(bits_of(c[0]))
-        request.second = wp.uint32(bits_of(c[1]))
-        packed = bits_of(c[2])
-        request.component = packed & 3
-        request.rounding_sample = wp.uint32(packed)
-        request.slot = bits_of(c[3])
-        request.target = wp.where(wp.static(confocal), bits_of(c[3]), -1)
-        return request
-
-    return (write_pair, read_pair) if short else (write_vector, read_vector)
 
 
 @memoised
@@ -283,8 +209,7 @@ def make_queue(
     spec: TransportSpec, flights: bool, used: bool, long: bool, traces: bool
 ) -> tuple[wp.Function, wp.Function, wp.Function]:
     """Three Warp functions: ``memory() -> int``, see `_make_memory`; ``push(s, request, world, sink, memory)`` adds
-    what is wanted; ``pop(memory, lane, takes, size, count) -> Request``, the last ones for the so many lanes that take
-    one.
+    what is wanted; ``pop(memory, lane, takes, size, count) -> Request``, the last for so many lanes that take one.
 
     Args:
         spec: Of the requests.
@@ -294,10 +219,8 @@ def make_queue(
         traces: Whether there are lanes that take none, since they wait for a shadow ray.
     """
     confocal, polarised, has_slot, more = spec.confocal, spec.polarised, spec.mesh or spec.sea, _has_more(spec, flights)
-    lines, derivative_vectors = spec.lines, -(-len(spec.derivatives) // 4)
-    carried = 3 + more
+    lines, derivative_vectors, carried = spec.lines, -(-len(spec.derivatives) // 4), 3 + more
     entries, vectors = _size(spec, flights, long)
-    write_words, read_words = _make_words(spec, more, 2 * entries)
     warp_memory = _make_memory(vectors * entries * used, flights and long and not traces)
 
     @wp.func
@@ -312,7 +235,9 @@ def make_queue(
     def write(memory: int, entry: int, request: Request):
         put(memory, entry, 0, wp.vec4(request.x[0], request.x[1], request.x[2], request.weight))
         put(memory, entry, 1, wp.vec4(request.u[0], request.u[1], request.u[2], request.path))
-        write_words(memory, entry, request)
+        packed = from_bits(request.component + int(request.rounding_sample & _UPPER_24))
+        last = from_bits(wp.where(wp.static(confocal), request.target, request.slot))
+        put(memory, entry, 2, wp.vec4(from_bits(int(request.first)), from_bits(int(request.second)), packed, last))
         if wp.static(more):
             lens = wp.vec2(request.lens[0], request.lens[1])
             if request.interval[0] >= request.interval[1]:
@@ -347,7 +272,13 @@ def make_queue(
         request.weight = a[3]
         request.u = wp.vec3(b[0], b[1], b[2])
         request.path = b[3]
-        request = read_words(memory, entry, request)
+        c = get(memory, entry, 2)
+        request.first = wp.uint32(bits_of(c[0]))
+        request.second = wp.uint32(bits_of(c[1]))
+        request.component = bits_of(c[2]) & 3
+        request.rounding_sample = wp.uint32(bits_of(c[2]))
+        request.slot = bits_of(c[3])
+        request.target = wp.where(wp.static(confocal), bits_of(c[3]), -1)
         if wp.static(more):
             d = get(memory, entry, 3)
             request.interval = wp.vec2(d[0], d[1])

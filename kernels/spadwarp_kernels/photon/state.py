@@ -11,13 +11,13 @@ from spadwarp_kernels.optics.camera import BEFORE, Camera, Gate, gate_bin
 from spadwarp_kernels.optics.laser import Laser, Scan
 from spadwarp_kernels.optics.polarisation import Polarisation
 from spadwarp_kernels.optics.sea import Sea
-from spadwarp_kernels.surface.bvh import NO_NODE, TreeWalk
+from spadwarp_kernels.surface.bvh import TreeWalk
 from spadwarp_kernels.surface.mesh import Surfaces
 from spadwarp_kernels.surface.ray_cast import SurfaceHit
 from spadwarp_kernels.tally import ledger
 from spadwarp_kernels.tally.flux import Flux
 from spadwarp_kernels.tally.ledger import add_to_ledger, to_ledger
-from spadwarp_kernels.tally.tally import BACKSCATTER, add_pending, add_to_words, atomic_add_int64, tally_components
+from spadwarp_kernels.tally.tally import BACKSCATTER, add_pending, atomic_add_int64, tally_components
 from spadwarp_kernels.water.limits import Limits
 from spadwarp_kernels.water.medium import Layers, Lines, Medium
 from spadwarp_kernels.water.phase_functions import Guiding
@@ -99,14 +99,6 @@ class Launch:
 
 
 @wp.struct
-class Draws:
-    """The random numbers of a thread."""
-
-    base: wp.uint64  # id of the launch's first photon
-    keys: RoundKeys  # those of the world, held in registers on CUDA
-
-
-@wp.struct
 class Account:
     """What a thread needs to add to a sink."""
 
@@ -116,11 +108,8 @@ class Account:
 
 @wp.struct
 class Weight:
-    """The weight of a photon, and its account.
-
-    `absorbed_water` is what photons had, less what was left and what was booked. It is what water took once the
-    thread's other sums for the ledger are subtracted, at its end.
-    """
+    """The weight of a photon, and its account. `absorbed_water` is what photons had, less what was left and what was
+    booked. It is what water took once the thread's other sums for the ledger are subtracted, at its end."""
 
     value: float  # fraction of the photon that is left
     taken: wp.int64  # by which the last change lowered it, in ledger units
@@ -194,6 +183,7 @@ class PhotonState:
     first: int  # number of the first of the warp's 32 new photons within the launch
     taken: int  # how many of them have been taken
     # The photon:
+    base: wp.uint64  # id of the launch's first photon
     photon: int  # number within the launch
     x: wp.vec3  # position [m]
     u: wp.vec3  # unit direction
@@ -244,22 +234,6 @@ PhotonRef: TypeAlias = wp.ref[PhotonState]
 
 
 @wp.func
-def first_state(world: WorldRef, slot: int) -> PhotonState:
-    """A thread before its first photon."""
-    s = PhotonState()
-    s.stage = START
-    s.account.slot = slot
-    s.first = -1
-    s.taken = 32
-    s.albedo = world.medium.albedo
-    s.view = world.camera.view
-    s.target = -1
-    s.hit.face = -1  # for good where there is no mesh: so a compiler leaves out what is done on faces
-    s.walk.node = NO_NODE
-    return s
-
-
-@wp.func
 def is_planned(flight: Flight) -> bool:
     """Whether an estimator wants to score a part of the flight."""
     return flight.interval[0] < flight.interval[1]
@@ -277,11 +251,8 @@ def shorten(flight: wp.ref[Flight], distance: float):
 
 @wp.func
 def reweigh(w: wp.ref[Weight], factor: float):
-    """Multiplies the weight by a factor.
-
-    The ledger is written where weight changes hands; water takes what is missing there. What is taken is to be added to
-    one of the thread's sums for the ledger, or to be booked by `book_weight`.
-    """
+    """Multiplies the weight by a factor. The ledger is written where weight changes hands; water takes what is missing
+    there. What is taken is to be added to one of the thread's sums for the ledger, or to be booked by `book_weight`."""
     before = to_ledger(w.value)
     w.value *= factor
     w.taken = before - to_ledger(w.value)
@@ -327,10 +298,8 @@ def merged_index(camera: Camera, gate: Gate, pixel: int, path: float, component:
 
 @wp.func
 def to_fixed_point(units: float, rounding_sample: float) -> wp.int64:
-    """units >= 0, rounded up with probability equal to its fraction, for rounding_sample uniform in [0, 1).
-
-    For samples on the grid k / 2^24 the mean is kept to 2^-25 unit, or 2^-24 of the value where that is more.
-    """
+    """units >= 0, rounded up with probability equal to its fraction, for rounding_sample uniform in [0, 1). For samples
+    on the grid k / 2^24 the mean is kept to 2^-25 unit, or 2^-24 of the value where that is more."""
     return wp.int64(units + rounding_sample)
 
 
@@ -348,10 +317,10 @@ def _make_deposit_unsigned(count: int) -> wp.Function:
             book(account, sink, wp.where(exact > DEPOSIT_LIMIT, ledger.CLIPPED, ledger.INVALID), wp.int64(1))
         elif c.index >= 0:
             if exact >= 1.0:
-                account.pending = add_pending(sink.tally, account.pending, c.index, units)
+                account.pending = add_pending(sink.tally, sink.low, account.pending, c.index, units)
             else:
                 if units > wp.int64(0):
-                    account.pending = add_pending(sink.tally, account.pending, c.index, units)
+                    account.pending = add_pending(sink.tally, sink.low, account.pending, c.index, units)
                 voxels = sink.tally.shape[0] // wp.static(count)
                 component = wp.where(c.index >= voxels, 1, 0) + wp.where(c.index - voxels >= voxels, 1, 0)
                 entry = ledger.BELOW_UNIT + component
@@ -378,11 +347,10 @@ def _deposit_signed(account: AccountRef, sink: SinkRef, index: int, units: float
 
 
 @memoised
-def make_deposit(signed: int, kinds: int, split: bool, sea: bool = False, lines: bool = False) -> wp.Function:
+def make_deposit(signed: int, kinds: int, sea: bool = False, lines: bool = False) -> wp.Function:
     """The Warp function ``(account, sink, world, contribution)`` that adds a contribution to the tally, with so many
-    parameters or channels that have signs and so many kinds of derivatives by block; `split`: the low words of the
-    tally are apart; `sea`: the tally has a component of light that met the surface of the sea alone; `lines`:
-    the channels are lines with delays of their own."""
+    parameters or channels that have signs and so many kinds of derivatives by block; `sea`: the tally has a component
+    of light that met the surface of the sea alone; `lines`: the channels are lines with delays of their own."""
     deposit_unsigned = _make_deposit_unsigned(len(tally_components(sea)))
 
     @wp.func
@@ -406,11 +374,6 @@ def make_deposit(signed: int, kinds: int, split: bool, sea: bool = False, lines:
                             units = c.value * blocks.memory[score_entry(blocks, 1, q, k)] * blocks.scale[q]
                             p = wp.static(signed) + q * blocks.count + k
                             _deposit_signed(account, sink, c.index * width + p, units, c.rounding_sample)
-        if wp.static(split):
-            units = c.value * sink.scale
-            if c.index >= 0 and units >= 1.0 and units <= DEPOSIT_LIMIT:
-                add_to_words(sink.tally, sink.low, c.index, to_fixed_point(units, c.rounding_sample))
-                return
         deposit_unsigned(account, sink, c)
 
     return deposit

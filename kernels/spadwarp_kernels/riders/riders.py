@@ -52,13 +52,10 @@ def make_rider(spec: TransportSpec) -> Rider:
 
 def _make_lines_rider(spec: TransportSpec) -> Rider:
     """Light of other wavelengths on the same paths: of other lines of the laser, and what has become such light by one
-    inelastic scattering at any of the events so far.
-
-    Photons fly and scatter as light of the laser does; what would have been scattered inelastically at an event, in
-    place of elastically, is carried on with the coefficients of its own wavelength over those, and so is light of a
-    line of the laser from the start. Thus no photon is spent on what few of them do, and each brings light of all
-    wavelengths.
-    """
+    inelastic scattering at any of the events so far. Photons fly and scatter as light of the laser does; what would
+    have been scattered inelastically at an event, in place of elastically, is carried on with the coefficients of its
+    own wavelength over those, and so is light of a line of the laser from the start. Thus no photon is spent on what
+    few of them do, and each brings light of all wavelengths."""
     count = spec.channels
 
     @wp.func
@@ -299,7 +296,7 @@ def _make_block_fly(kinds: int, beside: Rider) -> wp.Function:
     def fly(c: CarriedRef, world: WorldRef, x: wp.vec3, u: wp.vec3, length: float):
         beside.fly(c, world, x, u, length)
         blocks = world.derivatives.blocks
-        line = grid_line(blocks.grid, x, u, length)
+        line = grid_line(blocks.grid, blocks.grid.size, 1, x, u, length)
         if line.begin < line.end:
             place = first_place(line, blocks.grid.size)
             while place.leave < line.end:

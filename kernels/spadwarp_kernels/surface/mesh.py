@@ -8,6 +8,7 @@ import warp as wp
 
 from spadwarp_kernels.base import check
 from spadwarp_kernels.base.check import ArgumentError
+from spadwarp_kernels.base.native import fill
 from spadwarp_kernels.optics.camera import Camera
 from spadwarp_kernels.optics.visibility import near_depth_map
 
@@ -24,8 +25,7 @@ class Textures:
     """Images on faces; arrays of length 0 where there are none."""
 
     face: wp.array[int]  # texture of each face, -1 for none
-    coordinates: wp.array2d[wp.vec2]
-    """(u, v) of the corners of each face, [faces, 3]; u to the right, v up, images repeat with period 1."""
+    coordinates: wp.array2d[wp.vec2]  # (u, v) of each face's corners, [faces, 3]; u right, v up, period 1
     region: wp.array[wp.vec3i]  # (offset into `texels`, width, height) of each texture
     texels: wp.array[float]  # reflectance factors in [0, 1], row after row from the top
 
@@ -42,13 +42,11 @@ class Surfaces:
     order: wp.array[int]  # likewise
     reflectance: wp.array[float]  # of each face, in [0, 1]
     near_depth: wp.array2d[float]  # what the camera cannot miss, see `near_depth_map`; empty if nothing is known
-    corner_reflectance: wp.array[wp.vec3]
-    """At the three corners of each face, instead of `reflectance`; empty unless it varies."""
+    corner_reflectance: wp.array[wp.vec3]  # at each face's corners, in place of `reflectance`; empty unless it varies
     textures: Textures  # images that multiply the corners' reflectance
     specular: wp.array[float]  # reflectance of the facets of the specular lobe, of each face; empty if there is none
     roughness: wp.array[float]  # their width parameter, see `microfacet`
-    depth: wp.array[int]
-    """Of the nodes of a moving mesh's tree on CUDA; else empty."""
+    depth: wp.array[int]  # of the nodes of a moving mesh's tree on CUDA; else empty
     levels: int  # their number; 1 for a moving mesh on the CPU
     extent: float  # largest coordinate that the tree is made for [m]
     patches: wp.array[wp.vec4]  # of a mesh of up to BRUTE_FORCE_FACES faces on CUDA, for rays that try them all
@@ -250,22 +248,14 @@ def surface_choices(surfaces: Surfaces) -> dict[str, bool]:
 
 def no_textures(device: wp.DeviceLike = None) -> Textures:
     """Empty arrays in place of `make_textures`."""
-    return _textures(np.zeros(0), np.zeros((0, 3, 2)), np.zeros((0, 3)), np.zeros(0), device)
-
-
-def _textures(face: Any, coordinates: Any, region: Any, texels: Any, device: wp.DeviceLike) -> Textures:
-    textures = Textures()
-    textures.face = wp.array(np.asarray(face, np.int32), dtype=int, device=device)
-    textures.coordinates = wp.array(np.asarray(coordinates, np.float32), dtype=wp.vec2, device=device)
-    textures.region = wp.array(np.asarray(region, np.int32), dtype=wp.vec3i, device=device)
-    textures.texels = wp.array(np.asarray(texels, np.float32), dtype=float, device=device)
-    return textures
+    made = fill(Textures(), device, face=np.zeros(0), coordinates=np.zeros((0, 3, 2)))
+    return fill(made, device, region=np.zeros((0, 3)), texels=np.zeros(0))
 
 
 def make_textures(
     face: np.ndarray, coordinates: np.ndarray, images: Sequence[np.ndarray], *, device: wp.DeviceLike = None
 ) -> Textures:
-    """Images for the faces of a mesh.
+    """Images for the faces of a mesh. Raises `ArgumentError`.
 
     Args:
         face: Index into `images` for each face, -1 for none; integers [faces].
@@ -273,9 +263,6 @@ def make_textures(
             its upper right one; outside of [0, 1] it repeats.
         images: Reflectance factors in [0, 1], each [rows, columns], the first row on top.
         device: Where to.
-
-    Raises:
-        ArgumentError: Another shape, or a value out of range.
     """
     check.kind("images", images, Sequence)
     device = check.device("device", device)
@@ -286,4 +273,5 @@ def make_textures(
     coordinates = check.numbers("coordinates", coordinates, (face.size, 3, 2), "(-inf, inf)")
     ends = np.cumsum([0, *(image.size for image in images)])
     region = [(start, image.shape[1], image.shape[0]) for start, image in zip(ends, images, strict=False)]
-    return _textures(face, coordinates, region, np.concatenate([image.ravel() for image in images]), device)
+    texels = np.concatenate([image.ravel() for image in images])
+    return fill(Textures(), device, face=face, coordinates=coordinates, region=region, texels=texels)

@@ -13,7 +13,7 @@ A patch is a triangle or a parallelogram, in five vec4 (rows) of `patches`:
 import numpy as np
 import warp as wp
 
-from spadwarp_kernels.base.native import bits_of
+from spadwarp_kernels.base.native import bits_of, load_row
 
 from .triangle import WIDENING, middle_planes
 
@@ -171,28 +171,8 @@ def nearest_patch(patches: wp.array[wp.vec4], x: wp.vec3, u: wp.vec3, reach: flo
     ...
 
 
-@wp.func_native("""
-#if defined(__CUDA_ARCH__)
-    const float4 v = __ldg(reinterpret_cast<const float4*>(rows.data) + static_cast<int64_t>(row));
-    return wp::vec4(v.x, v.y, v.z, v.w);
-#else
-    return rows.data[row];
-#endif
-""")
-def load_row(rows: wp.array[wp.vec4], row: int) -> wp.vec4:
-    """An entry of a contiguous array that no kernel changes, in one load on CUDA."""
-    ...
-
-
-@wp.func_native("""
-#if defined(__CUDA_ARCH__)
-    const int4 v = __ldg(reinterpret_cast<const int4*>(patches.data + static_cast<int64_t>(row)) + 4);
-    return second ? wp::vec2i(v.z, v.w) : wp::vec2i(v.x, v.y);
-#else
-    const int* v = reinterpret_cast<const int*>(patches.data + row + 4);
-    return second ? wp::vec2i(v[2], v[3]) : wp::vec2i(v[0], v[1]);
-#endif
-""")
+@wp.func
 def patch_faces(patches: wp.array[wp.vec4], row: int, second: bool) -> wp.vec2i:
     """Slot and index of the first or the second face of the patch that begins at a row."""
-    ...
+    v = load_row(patches, row + 4)
+    return wp.vec2i(bits_of(wp.where(second, v[2], v[0])), bits_of(wp.where(second, v[3], v[1])))

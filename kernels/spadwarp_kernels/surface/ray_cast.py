@@ -5,13 +5,13 @@ from typing import NamedTuple
 import warp as wp
 
 from spadwarp_kernels.base.kernels import memoised
-from spadwarp_kernels.base.native import bits_of
+from spadwarp_kernels.base.native import bits_of, load_row, times_sign
 from spadwarp_kernels.base.rotations import inverse_direction
 from spadwarp_kernels.optics.camera import Camera, pixel_direction
 
 from .bvh import NO_NODE, Stack, TreeWalk, place, step_leaf, step_node
 from .mesh import Surfaces
-from .patches import load_row, nearest_patch, patch_faces
+from .patches import nearest_patch, patch_faces
 from .reflectance import (
     face_reflectance,
     ggx_brdf,
@@ -20,7 +20,7 @@ from .reflectance import (
     reflectance_at,
     reflection_pdf,
 )
-from .triangle import face_in, face_normal, times_sign
+from .triangle import face_in, face_normal
 from .wide import walk_wide
 
 __all__ = ["SurfaceHit", "intersect_mesh", "intersect_surfaces", "offset_from_surface", "truth_kernel"]

@@ -10,10 +10,12 @@ import math
 from collections.abc import Sequence
 from typing import Any
 
+import numpy as np
 import warp as wp
 
 from spadwarp_kernels.base import check
 from spadwarp_kernels.base.check import ArgumentError
+from spadwarp_kernels.base.native import fill
 
 from .tally import add_to_halves, atomic_add_int64
 
@@ -244,7 +246,6 @@ def make_flux_volume(
     for name, vector in (("shape", shape), ("lower", lower), ("origin", origin)):
         check.vector(name, vector)
     check.choice("estimator", estimator, FLUX_KINDS[:2])
-    volume: Any = FluxVolume()
     rows, shift = [], []
     edge, turn = check.numbers("edge", edge, (3,)), check.numbers("rotation", rotation, (3, 3))
     for k, width in enumerate(edge.tolist()):
@@ -252,14 +253,12 @@ def make_flux_volume(
         check.integer(f"shape[{k}]", shape[k], 1, 1 if width == math.inf else 1 << 20)
         rows += [x / width for x in turn[k].tolist()]
         shift.append((origin[k] - lower[k]) / width)
-    volume.turn, volume.shift, volume.size = wp.mat33(*rows), wp.vec3(*shift), wp.vec3i(*shape)
     gate_path = float(check.numbers("gate_path", gate_path, ()))
     check.number("gate_path", min(gate_path, 1e30), "(0, inf)")
-    volume.gates = check.integer("gates", gates, 1, 1 if gate_path == math.inf else 1 << 20)
-    volume.gate_start = check.number("gate_start", gate_start, "(-inf, inf)")
-    volume.gates_per_metre, volume.by_collision = 1.0 / gate_path, int(estimator == "collision")
-    volume.scale = check.number("scale", scale, "(0, inf)")
-    return volume
+    gates = check.integer("gates", gates, 1, 1 if gate_path == math.inf else 1 << 20)
+    box = fill(FluxVolume(), turn=np.reshape(rows, (3, 3)), shift=shift, size=[*shape], gates=gates)
+    fill(box, gate_start=check.number("gate_start", gate_start), gates_per_metre=1.0 / gate_path)
+    return fill(box, by_collision=int(estimator == "collision"), scale=check.number("scale", scale, "(0, inf)"))
 
 
 def make_flux_planes(
@@ -274,15 +273,13 @@ def make_flux_planes(
     scale: float = 2.0**20,
 ) -> FluxPlanes:
     """So many planes, see `FluxPlanes`; `make_flux` takes their positions, in order. Raises `ArgumentError`."""
-    planes: Any = FluxPlanes()
-    for name, vector in {"axis": axis, "right": right, "centre": centre}.items():
+    for name, vector in (("axis", axis), ("right", right), ("centre", centre)):
         check.vector(name, vector, unit=name != "centre")
-        setattr(planes, name, wp.vec3(*vector))
-    for name, number, least in (("count", count, 1), ("polar", polar, 0), ("azimuth", azimuth, 0)):
-        setattr(planes, name, check.integer(name, number, least, 1 << 16))
-    planes.radius2 = min(check.number("radius", min(radius, 1e15), "(0, inf)") ** 2, 1e30)
-    planes.scale = check.number("scale", scale, "(0, inf)")
-    return planes
+    whole = {"count": count, "polar": polar, "azimuth": azimuth}
+    whole = {name: check.integer(name, n, int(name == "count"), 1 << 16) for name, n in whole.items()}
+    radius2 = min(check.number("radius", min(radius, 1e15), "(0, inf)") ** 2, 1e30)
+    planes = fill(FluxPlanes(), axis=axis, right=right, centre=centre, **whole, radius2=radius2)
+    return fill(planes, scale=check.number("scale", scale, "(0, inf)"))
 
 
 def make_flux(sections: Sequence[Any], positions: Sequence[float] = (), *, device: wp.DeviceLike = None) -> Flux:
@@ -307,7 +304,4 @@ def make_flux(sections: Sequence[Any], positions: Sequence[float] = (), *, devic
         raise ArgumentError(f"positions: {len(positions)} of {begin} planes")
     flux.size = size
     flux.collision = next(iter(kinds["collisions"]), FluxVolume())
-    for name, found in kinds.items():
-        setattr(flux, name, wp.array(found, dtype=FluxPlanes if name == "planes" else FluxVolume, device=device))
-    flux.positions = wp.array(list(positions), dtype=float, device=device)
-    return flux
+    return fill(flux, device, **kinds, positions=list(positions))

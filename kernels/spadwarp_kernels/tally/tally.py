@@ -45,7 +45,16 @@ def atomic_add_int64(tally: wp.array[wp.int64], index: int, value: wp.int64):
 
 @wp.func_native("""
 #if defined(__CUDA_ARCH__)
-    atomicAdd(reinterpret_cast<unsigned long long*>(tally.data) + index, static_cast<unsigned long long>(value));
+    unsigned long long* voxel = reinterpret_cast<unsigned long long*>(tally.data) + index;
+    if (low.shape.dims[0] > 0) {
+        const unsigned part = static_cast<unsigned>(value);
+        const unsigned before = atomicAdd(reinterpret_cast<unsigned*>(low.data) + index, part);
+        const unsigned high = static_cast<unsigned>(value >> 32) + (before + part < part ? 1u : 0u);
+        // 32 bits are enough: a carry out of the high half is lost in an addition of 64 bits, too.
+        if (high) atomicAdd(reinterpret_cast<unsigned*>(voxel) + 1, high);
+    } else {
+        atomicAdd(voxel, static_cast<unsigned long long>(value));
+    }
     return pending;
 #else
     long long* voxels = reinterpret_cast<long long*>(tally.data);
@@ -54,9 +63,12 @@ def atomic_add_int64(tally: wp.array[wp.int64], index: int, value: wp.int64):
     return wp::vec2l(index, value);
 #endif
 """)
-def add_pending(tally: wp.array[wp.int64], pending: wp.vec2l, index: int, value: wp.int64) -> wp.vec2l:
-    """`atomic_add_int64`, on the CPU one call later: a core stands still while a voxel comes from memory, so the
-    (index, value) that the call before returned is added now, and the memory of this one is requested."""
+def add_pending(
+    tally: wp.array[wp.int64], low: wp.array[wp.uint32], pending: wp.vec2l, index: int, value: wp.int64
+) -> wp.vec2l:
+    """`atomic_add_int64` of value >= 0; on CUDA the low words of the voxels may be apart, else `low` is empty. On the
+    CPU one call later: a core stands still while a voxel comes from memory, so the (index, value) that the call before
+    returned is added now, and the memory of this one is requested."""
     ...
 
 
@@ -129,21 +141,6 @@ PHOTONS_PER_VOXEL = 4
 def splitting_pays(voxels: int, photon_count: int) -> bool:
     """Whether low words make a launch of so many photons faster, with so many voxels in a component of the tally."""
     return 8 * voxels > CACHE_BYTES and photon_count >= PHOTONS_PER_VOXEL * voxels
-
-
-@wp.func_native("""
-#if defined(__CUDA_ARCH__)
-    const unsigned low = static_cast<unsigned>(value);
-    const unsigned before = atomicAdd(reinterpret_cast<unsigned*>(split_accumulators.data) + index, low);
-    const unsigned high = static_cast<unsigned>(value >> 32) + (before + low < low ? 1u : 0u);
-    // 32 bits are enough: a carry out of the high half is lost in an addition of 64 bits, too.
-    if (high)
-        atomicAdd(reinterpret_cast<unsigned*>(reinterpret_cast<long long*>(tally.data) + index) + 1, high);
-#endif
-""")
-def add_to_words(tally: wp.array[wp.int64], split_accumulators: wp.array[wp.uint32], index: int, value: wp.int64):
-    """Adds value >= 0 to a voxel whose low word is apart; on CUDA alone."""
-    ...
 
 
 @wp.kernel
@@ -245,13 +242,9 @@ def close_batch_kernel(
     overflow: wp.array[int],
 ):
     """Adds a batch to the total, to `half` if that is as long, and the square of its sum over components, times
-    `weight`, to a 128-bit sum, and empties it.
-
-    `sums` takes its components, over voxels; `overflow` is set where a total leaves [least, 2^62).
-
-    Integers, so that the sums depend neither on the order of the batches nor on how they were merged.
-    Launch: runs of `run` voxels from the `first` on.
-    """
+    `weight`, to a 128-bit sum, and empties it. `sums` takes its components, over voxels; `overflow` is set where a
+    total leaves [least, 2^62). Integers, so that the sums depend neither on the order of the batches nor on how they
+    were merged. Launch: runs of `run` voxels from the `first` on."""
     voxels = squares_low.shape[0]
     begin = (first + wp.tid()) * run
     end = wp.min(begin + run, voxels)
@@ -361,9 +354,7 @@ class Batches:
 
     def add(self, other: "Batches") -> None:
         """Adds the batches of another tally of the same components, which may be on another device and must rest.
-
-        Raises `ArgumentError` for another size or number of components.
-        """
+        Raises `ArgumentError` for another size or number of components."""
         check.kind("other", other, Batches)
         if other.second_moment[0].size != self.second_moment[0].size:
             raise ArgumentError(f"other has {other.second_moment[0].size} voxels, not {self.second_moment[0].size}")
@@ -423,7 +414,7 @@ def tally_rates(
     parameters: int = 1,
     parameter: int = 0,
 ) -> wp.array:
-    """Tallies added up over components, float32 `[pixel, bin]` on their device.
+    """Tallies added up over components, float32 `[pixel, bin]` on their device. Raises `ArgumentError`.
 
     Args:
         tally: int64, `Data.tally`, or `Data.gradients` with so many `parameters`.
@@ -432,9 +423,6 @@ def tally_rates(
         components: How many of `tally_components`, from the first on; by default all.
         parameters: Derivatives side by side in a voxel.
         parameter: Which of them.
-
-    Raises:
-        ArgumentError: Arrays or numbers that do not fit each other.
     """
     check.array("scale", scale, wp.float64, (None,), tally.device if isinstance(tally, wp.array) else None)
     bins, parameters = check.integer("bins", bins, 1), check.integer("parameters", parameters, 1)

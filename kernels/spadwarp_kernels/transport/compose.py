@@ -21,15 +21,15 @@ from . import stages
 class Stages(NamedTuple):
     """What becomes of a photon, as Warp functions; states are changed in place."""
 
-    prepare: wp.Function  # ``(draws, world, thread, launch) -> int``, of a thread
+    prepare: wp.Function  # ``(world, thread, launch) -> PhotonState``, of a thread
     emit: wp.Function  # see `Beam.emit`
     begin: wp.Function  # ``(s, world, sink, emitted, id)``, to FLIGHT
-    fly: wp.Function  # ``(s, world, draws, words)``, to EVENT or RAY
+    fly: wp.Function  # ``(s, world, words)``, to EVENT or RAY
     trace: wp.Function  # ``(s, world)``, from RAY to EVENT, without other threads
     meet: wp.Function  # ``(s, world, distance) -> bool``, whether the flight ends on the face at that distance [m]
     cross: wp.Function  # ``(s, world, sink)``, what the photon itself brings on its flight
     collide: wp.Function  # ``(s, world, sink)``, to SCATTER or END
-    scatter: wp.Function  # ``(s, world, sink, draws)``, to FLIGHT or END
+    scatter: wp.Function  # ``(s, world, sink)``, to FLIGHT or END
     finish: wp.Function  # ``(s, sink)``
     flush: wp.Function  # ``(s, sink)``, of a thread
     # ``(s, world, sink, memory)``: the flight and the event are scored, or what is to be scored goes to the queue.
@@ -53,22 +53,19 @@ class Stages(NamedTuple):
 
 
 @memoised
-def compose(spec: TransportSpec, cuda: bool, split: bool) -> Stages:
-    """The stages of a spec; `split`: on CUDA, the low words of the tally are apart.
-
-    A thread moves its photons alone on a CPU, with Warp's own rays, and where blocks of cells keep what they score with
-    the thread. A handful of faces is tried on the spot; but a core walks the tree of a box in a third of the time that
-    its twelve faces take.
-    """
+def compose(spec: TransportSpec, cuda: bool) -> Stages:
+    """The stages of a spec. A thread moves its photons alone on a CPU, with Warp's own rays, and where blocks of cells
+    keep what they score with the thread. A handful of faces is tried on the spot; but a core walks the tree of a box in
+    a third of the time that its twelve faces take."""
     estimator = make_estimator(spec)
     alone = not cuda or bool(spec.blocks) or (spec.mesh and spec.use_warp_bvh)
     in_tree, flies_on = spec.mesh and not spec.faces.tried, estimator.cross is not None
     flights, scores = estimator.request_flight is not None, estimator.score is not None
     two_requests = flights and scores and long_queue_fits(spec, in_tree)
     meet = stages.make_meet(estimator.meet)
-    deposit = make_deposit(spec.signed, len(spec.blocks), split, spec.sea is not None, spec.lines)
+    deposit = make_deposit(spec.signed, len(spec.blocks), spec.sea is not None, spec.lines)
     memory, push, pop = make_queue(spec, flights, scores, two_requests, in_tree)
-    serve = _make_serve(spec, split, deposit, waits=in_tree and not alone) if scores else push
+    serve = _make_serve(spec, deposit, waits=in_tree and not alone) if scores else push
     ask_flight, ask_event = _make_asks(spec, _make_serve_now(serve) if alone and scores else push)
     return Stages(
         prepare=stages.make_prepare(spec.stepped, bool(spec.blocks), cuda),
@@ -154,11 +151,11 @@ def _make_asks(spec: TransportSpec, take: wp.Function) -> tuple[wp.Function, wp.
     return ask_flight, ask_event
 
 
-def _make_serve(spec: TransportSpec, split: bool, deposit: wp.Function, waits: bool) -> wp.Function:
+def _make_serve(spec: TransportSpec, deposit: wp.Function, waits: bool) -> wp.Function:
     """See `Stages.serve`; with `waits` a contribution behind which a tree must be walked is left in the state, else the
     ray is traced here, and what a face hides is set to 0."""
     faces, sight, reflects, sea = spec.faces, spec.sight, spec.reflecting, spec.sea is not None
-    score, score_images = make_estimator(spec).score, make_score_images(spec, split)
+    score, score_images = make_estimator(spec).score, make_score_images(spec)
 
     @wp.func
     def is_seen(s: PhotonRef, found: wp.ref[Scored], world: WorldRef) -> bool:

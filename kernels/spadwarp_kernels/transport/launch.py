@@ -58,11 +58,7 @@ _STRUCTS = {name: var.type for name, var in World.vars.items() if name not in ("
 
 @dataclass(frozen=True)
 class Model:
-    """What is transported through: immutable, on one device.
-
-    Raises:
-        ArgumentError: Another kind of struct, a device that does not exist, or a scale that is not positive.
-    """
+    """What is transported through: immutable, on one device. Raises `ArgumentError`."""
 
     device: wp.Device  # Warp device that holds the arrays
     medium: Medium  # parameter structs
@@ -76,12 +72,9 @@ class Model:
     scale: float  # tally units per emitted photon
     layers: Layers = field(default_factory=Layers)  # of a layered spec, from `make_layers`; empty otherwise
     scan: Scan = field(default_factory=Scan)  # raster of a confocal spec; empty otherwise
-    derivatives: Derivatives = field(default_factory=Derivatives)
-    """The parameters of a spec with derivatives or channels, from `make_derivatives`."""
-    polarisation: Polarisation = field(default_factory=Polarisation)
-    """Those of a polarised spec, from `make_polarisation`."""
-    lines: Lines = field(default_factory=Lines)
-    """Of a spec with `lines`, from `make_lines`."""
+    derivatives: Derivatives = field(default_factory=Derivatives)  # of a spec with derivatives or channels
+    polarisation: Polarisation = field(default_factory=Polarisation)  # of a polarised one, by `make_polarisation`
+    lines: Lines = field(default_factory=Lines)  # of one with `lines`, from `make_lines`
     flux: Flux = field(default_factory=Flux)  # sections of a spec with flux, from `make_flux`
     sea: Sea = field(default_factory=Sea)  # the surface of a sea, from `make_sea`; of index 0 without one
     split_accumulators: bool = False
@@ -118,11 +111,8 @@ class Data:
     tally: wp.array  # int64 [component * height * width * bin], fixed point
     ledger: wp.array  # int64 [LEDGER_WIDTH * LEDGER_SLOTS]; the sum over slots is the ledger, see `read_ledger`
     records: Records  # terminal states of the last launch's photons
-    cursor: wp.array
-    """int32 [1]: how many photons of the running launch have been handed out; launches that share it go to one
-    stream."""
-    offset: wp.array | None = None
-    """uint64 [1], added to the photons' ids where `spec.stepped` is set; the caller moves it on."""
+    cursor: wp.array  # int32 [1]: how many photons warps have taken; launches that share it go to one stream
+    offset: wp.array | None = None  # uint64 [1], added to the ids where `spec.stepped` is set; the caller moves it on
     reflecting: bool = False  # whether faces of the domain reflect, so that `read_ledger` reports on them
     has_sea: bool = False  # whether there is a surface of a sea, likewise
     gradients: wp.array | None = None
@@ -131,7 +121,7 @@ class Data:
     flux: wp.array | None = None  # int64 [model.flux.size], the tally of its sections; None without them
     split_accumulators: wp.array | None = None
     """uint32, as long as the tally, zero between launches; made by the first launch that is large enough, see
-    `tally.splitting_pays`, and used by those after it."""
+    `tally.splitting_pays`."""
     flux_halves: wp.array | None = None  # likewise the low bits of `flux`, see `tally.add_to_halves`
 
 
@@ -389,33 +379,13 @@ CUDA_THREADS = 1 << 19
 _MOST_PHOTONS = 1 << 26
 
 
-def load_transport_kernel(
-    spec: TransportSpec, device: wp.DeviceLike = None, *, model: Model | None = None, photon_count: int = _MOST_PHOTONS
-) -> None:
-    """Compiles the kernel of a spec for a device, or loads it from Warp's cache, ahead of the first launch.
-
-    With `model`, the kernel of a first launch of `photon_count` photons, which later launches into the same data take,
-    too: with a large tally on CUDA it may be another one, see `Model.split_accumulators`.
-    """
+def load_transport_kernel(spec: TransportSpec, device: wp.DeviceLike = None) -> None:
+    """Compiles the kernel of a spec for a device, or loads it from Warp's cache, ahead of the first launch."""
     check_spec(spec)
     device = check.device("device", device)
-    split_accumulators = False
-    if model is not None:
-        check.kind("model", model, Model)
-        photon_count = check.integer("photon_count", photon_count, 1, _MOST_PHOTONS)
-        split_accumulators = splits_accumulators(spec, model, photon_count)
-    kernel = make_transport_kernel(spec, device.is_cuda, split_accumulators)
-    kernel.module.load(device, BLOCK_SIZE if device.is_cuda else 1)
+    make_transport_kernel(spec, device.is_cuda).module.load(device, BLOCK_SIZE if device.is_cuda else 1)
     # Loaded here and not by a worker: each thread that compiles makes Warp prepare its headers anew, 1.5 s on a CPU.
     wp.load_module(find_overflow_kernel.module, device=device)
-
-
-def splits_accumulators(spec: TransportSpec, model: Model, photon_count: int) -> bool:
-    """Whether a launch into a tally of the model keeps its low words apart; see `tally.split_accumulators`."""
-    if not (model.split_accumulators and model.device.is_cuda and make_estimator(spec).scores):
-        return False
-    voxels = model.tally_size // len(tally_components(spec.sea is not None))
-    return not (spec.signed or spec.blocks) and splitting_pays(voxels, photon_count)
 
 
 def launch_transport(
@@ -465,7 +435,7 @@ def prepare_transport(
     blocks = check.integer("threads", threads, BLOCK_SIZE) // BLOCK_SIZE
     check_launch(spec, model, data, most)
     device, split_accumulators = model.device, _split_accumulators(spec, model, data, most)
-    kernel = make_transport_kernel(spec, device.is_cuda, split_accumulators is not None)
+    kernel = make_transport_kernel(spec, device.is_cuda)
     sink = Sink()
     sink.tally, sink.ledger, sink.scale, sink.records = data.tally, data.ledger, model.scale, data.records
     sink.gradients, sink.low = data.gradients, split_accumulators
@@ -492,9 +462,10 @@ def prepare_transport(
 
 
 def _split_accumulators(spec: TransportSpec, model: Model, data: Data, photon_count: int) -> wp.array | None:
-    """Those of `data` for a launch that uses them: a large one, and after it also smaller ones, which would need
-    another kernel otherwise."""
-    if not splits_accumulators(spec, model, photon_count if data.split_accumulators is None else _MOST_PHOTONS):
+    """Those of `data` for launches on CUDA that are large enough; None for others."""
+    if not (model.split_accumulators and model.device.is_cuda and make_estimator(spec).scores):
+        return None
+    if not splitting_pays(model.tally_size // len(model.components), photon_count):
         return None
     if data.split_accumulators is None and not model.device.is_capturing:  # what is made there belongs to the graph
         data.split_accumulators = wp.zeros(data.tally.size, dtype=wp.uint32, device=model.device)

@@ -12,7 +12,7 @@ from spadwarp_kernels.base.philox import PREFETCHED_WORDS
 from spadwarp_kernels.base.rotations import inverse_direction
 from spadwarp_kernels.photon import queue, state
 from spadwarp_kernels.photon.spec import TransportSpec, check_spec
-from spadwarp_kernels.photon.state import Draws, Launch, PhotonRef, Sink, SinkRef, World, WorldRef
+from spadwarp_kernels.photon.state import Launch, PhotonRef, Sink, SinkRef, World, WorldRef
 from spadwarp_kernels.surface.bvh import NO_NODE, Stack, place, step_leaf, step_node
 from spadwarp_kernels.surface.ray_cast import surface_hit
 
@@ -22,19 +22,16 @@ __all__ = ["make_transport_kernel"]
 
 
 @memoised
-def make_transport_kernel(spec: TransportSpec, cuda: bool = False, split_accumulators: bool = False) -> wp.Kernel:
+def make_transport_kernel(spec: TransportSpec, cuda: bool = False) -> wp.Kernel:
     """The transport kernel for a spec; launch grid: any number of threads, which share the photons among them.
+    Raises `ArgumentError`.
 
-    On CUDA they must be a multiple of the block size, since whole warps vote. `split_accumulators`: on CUDA, the low
-    words of the tally are apart, see `tally.splitting_pays`.
-
-    Raises:
-        ArgumentError: An estimator that is not one of ESTIMATORS, or confocal with the plain lens.
+    On CUDA they must be a multiple of the block size, since whole warps vote.
     """
     check_spec(spec)
     if not cuda and spec != spec.on_cpu:
         return make_transport_kernel(spec.on_cpu)
-    stages = compose(spec, cuda, split_accumulators)
+    stages = compose(spec, cuda)
     options = {
         "module": "unique",
         "module_options": {"fast_math": cuda},
@@ -52,25 +49,24 @@ def _make_loop_alone(stages: Stages, cuda: bool, options: dict) -> wp.Kernel:
 
     @wp.kernel(**options)
     def transport(world: World, sink: Sink, launch: Launch):
-        draws = Draws()
-        s = state.first_state(world, stages.prepare(draws, world, wp.tid(), launch))
+        s = stages.prepare(world, wp.tid(), launch)
         if wp.static(cuda):  # noqa: SIM108, Warp has no such choice between arrays
             words = launch.cursor  # any: it is not used
         else:
             words = wp.zeros(shape=PREFETCHED_WORDS, dtype=int)
         for number in range(wp.tid(), launch.photon_count, launch.threads):
             s.photon = number
-            id = draws.base + wp.uint64(number)
+            id = s.base + wp.uint64(number)
             stages.begin(s, world, sink, stages.emit(world.laser, world.scan, world.seed, id), id)
             while s.stage != state.END:
-                stages.fly(s, world, draws, words)
+                stages.fly(s, world, words)
                 stages.trace(s, world)
                 stages.ask_flight(s, world, sink, 0)
                 stages.cross(s, world, sink)
                 stages.collide(s, world, sink)
                 if s.stage == state.SCATTER:
                     stages.ask_event(s, world, sink, 0)
-                    stages.scatter(s, world, sink, draws)
+                    stages.scatter(s, world, sink)
             stages.finish(s, sink)
         stages.flush(s, sink)
 
@@ -87,13 +83,11 @@ class WarpStatus:
 
 
 def _make_renew(stages: Stages) -> wp.Function:
-    """The Warp function ``(s, world, sink, base, launch, memory, lane)`` that finishes the photons of a warp that have
+    """The Warp function ``(s, world, sink, launch, memory, lane)`` that finishes the photons of a warp that have
     ended and gives the next to their lanes. All lanes take part."""
 
     @wp.func
-    def renew(
-        s: PhotonRef, world: WorldRef, sink: SinkRef, base: wp.uint64, launch: wp.ref[Launch], memory: int, lane: int
-    ):
+    def renew(s: PhotonRef, world: WorldRef, sink: SinkRef, launch: wp.ref[Launch], memory: int, lane: int):
         if s.stage == state.END:
             stages.finish(s, sink)
             s.stage = state.START
@@ -104,7 +98,7 @@ def _make_renew(stages: Stages) -> wp.Function:
         if s.taken >= 32:
             s.first = queue.take_photons(launch.cursor)
             s.taken = 0
-            own = stages.emit(world.laser, world.scan, world.seed, base + wp.uint64(s.first + lane))
+            own = stages.emit(world.laser, world.scan, world.seed, s.base + wp.uint64(s.first + lane))
             queue.exchange(memory, True, lane, own)
         entry += s.taken
         s.taken += votes[1]
@@ -113,7 +107,7 @@ def _make_renew(stages: Stages) -> wp.Function:
             s.stage = state.DONE
             if s.photon < launch.photon_count:
                 emitted = queue.exchange(memory, False, entry, wp.spatial_vector())
-                stages.begin(s, world, sink, emitted, base + wp.uint64(s.photon))
+                stages.begin(s, world, sink, emitted, s.base + wp.uint64(s.photon))
 
     return renew
 
@@ -126,8 +120,7 @@ def _make_loop_flat(stages: Stages, options: dict) -> wp.Kernel:
     @wp.kernel(**options)
     def transport(world: World, sink: Sink, launch: Launch):
         lane = wp.tid() % 32
-        draws = Draws()
-        s = state.first_state(world, stages.prepare(draws, world, wp.tid(), launch))
+        s = stages.prepare(world, wp.tid(), launch)
         memory = stages.memory()
         status = WarpStatus()
         status.enough = 32
@@ -138,18 +131,18 @@ def _make_loop_flat(stages: Stages, options: dict) -> wp.Kernel:
         while status.waiting < 32:
             flying = s.stage == state.FLIGHT
             if wp.static(not fused) and flying:
-                stages.fly(s, world, draws, launch.cursor)
+                stages.fly(s, world, launch.cursor)
             round = int(wp.static(2 - rounds))
             while round < 2:
                 if wp.static(fused):
                     if flying:
-                        stages.fly(s, world, draws, launch.cursor)
+                        stages.fly(s, world, launch.cursor)
                         stages.ask_flight(s, world, sink, memory)
                         stages.cross(s, world, sink)
                         stages.collide(s, world, sink)
                         if s.stage == state.SCATTER:
                             stages.ask_event(s, world, sink, memory)
-                            stages.scatter(s, world, sink, draws)
+                            stages.scatter(s, world, sink)
                 elif s.stage == state.EVENT:
                     if round == 0:
                         stages.ask_flight(s, world, sink, memory)
@@ -169,9 +162,9 @@ def _make_loop_flat(stages: Stages, options: dict) -> wp.Kernel:
                         ready = wp.static(stages.drains) and queued >= 32
                         stages.serve(s, request, world, sink)
             if wp.static(not fused) and s.stage == state.SCATTER:
-                stages.scatter(s, world, sink, draws)
+                stages.scatter(s, world, sink)
             if queue.count_lanes(s.stage >= state.START) >= wp.static(stages.start_lanes):
-                renew(s, world, sink, draws.base, launch, memory, lane)
+                renew(s, world, sink, launch, memory, lane)
                 done = queue.count_lanes(s.stage == state.DONE)
                 status.enough = wp.where(done == 32, 1, 32)
                 status.waiting = wp.where(queued > 0, 0, done)
@@ -201,31 +194,20 @@ class Ray:
 
 
 @wp.func
-def next_ray(s: PhotonRef) -> int:
-    """The ray that a thread traces: that which it has begun, that of its photon, or a shadow ray."""
-    ray = s.ray
-    if ray == state.NO_RAY:
-        ray = wp.where(s.stage == state.RAY, state.SURFACE_RAY, wp.where(s.hidden, state.SHADOW_RAY, state.NO_RAY))
+def next_ray(s: PhotonRef, scores: bool) -> Ray:
+    """The ray that a thread traces: that which it has begun, its photon's flight, or the way to the lens."""
+    if s.ray == state.NO_RAY:
+        s.ray = wp.where(s.stage == state.RAY, state.SURFACE_RAY, wp.where(s.hidden, state.SHADOW_RAY, state.NO_RAY))
+    ray = Ray()
+    ray.origin = s.x
+    ray.direction = s.u
+    ray.length = s.flight.reach
+    if scores:
+        if s.ray == state.SHADOW_RAY:
+            ray.origin = s.origin
+            ray.direction = wp.normalize(s.lens - s.origin)
+            ray.length = wp.length(s.lens - s.origin)
     return ray
-
-
-def _make_ray_geometry(scores: bool) -> wp.Function:
-    """The Warp function ``s -> Ray``: the flight, or the way from the scored point to the lens."""
-
-    @wp.func
-    def ray_geometry(s: PhotonRef) -> Ray:
-        ray = Ray()
-        ray.origin = s.x
-        ray.direction = s.u
-        ray.length = s.flight.reach
-        if wp.static(scores):
-            if s.ray == state.SHADOW_RAY:
-                ray.origin = s.origin
-                ray.direction = wp.normalize(s.lens - s.origin)
-                ray.length = wp.length(s.lens - s.origin)
-        return ray
-
-    return ray_geometry
 
 
 def _make_end_walk(stages: Stages) -> wp.Function:
@@ -252,7 +234,7 @@ def _make_end_walk(stages: Stages) -> wp.Function:
 def _make_loop_tree(stages: Stages, options: dict) -> wp.Kernel:
     """Warps that leave the water when enough of their lanes wait for a ray, and walk down the tree together."""
     used, flights = stages.scores, stages.flights
-    renew, ray_geometry, end_walk = _make_renew(stages), _make_ray_geometry(used), _make_end_walk(stages)
+    renew, end_walk = _make_renew(stages), _make_end_walk(stages)
     ray_lanes, walking_lanes = (GUIDED_RAY_LANES, GUIDED_WALKING_LANES) if flights else (RAY_LANES, WALKING_LANES)
     rounds = 2 if flights and not stages.two_requests else 1
     scatter_first = used and rounds == 1
@@ -260,8 +242,7 @@ def _make_loop_tree(stages: Stages, options: dict) -> wp.Kernel:
     @wp.kernel(**options)
     def transport(world: World, sink: Sink, launch: Launch):
         lane = wp.tid() % 32
-        draws = Draws()
-        s = state.first_state(world, stages.prepare(draws, world, wp.tid(), launch))
+        s = stages.prepare(world, wp.tid(), launch)
         stack = Stack()
         stack[0] = NO_NODE
         memory = stages.memory()
@@ -276,7 +257,7 @@ def _make_loop_tree(stages: Stages, options: dict) -> wp.Kernel:
             status.waiting = 0
             while status.waiting < wp.static(ray_lanes):
                 if s.stage == state.FLIGHT:
-                    stages.fly(s, world, draws, launch.cursor)
+                    stages.fly(s, world, launch.cursor)
                 round = int(wp.static(2 - rounds))
                 while round < 2:
                     if s.stage == state.EVENT and (wp.static(not used) or queued <= queue.MOST_LEFT):
@@ -289,7 +270,7 @@ def _make_loop_tree(stages: Stages, options: dict) -> wp.Kernel:
                             if s.stage == state.SCATTER:
                                 stages.ask_event(s, world, sink, memory)
                                 if wp.static(scatter_first):
-                                    stages.scatter(s, world, sink, draws)
+                                    stages.scatter(s, world, sink)
                     round += 1
                     # ---- Scores, by all lanes that have room for what they find
                     if wp.static(used):
@@ -300,15 +281,14 @@ def _make_loop_tree(stages: Stages, options: dict) -> wp.Kernel:
                             queued = queue.queue_size(memory, queue.SET_SIZE, wp.max(queued - free, 0))
                             stages.serve(s, request, world, sink)
                 if wp.static(not scatter_first) and s.stage == state.SCATTER:
-                    stages.scatter(s, world, sink, draws)
+                    stages.scatter(s, world, sink)
                 if queue.count_lanes(s.stage >= state.START) >= wp.static(stages.start_lanes):
-                    renew(s, world, sink, draws.base, launch, memory, lane)
+                    renew(s, world, sink, launch, memory, lane)
                     status.enough = wp.where(queue.count_lanes(s.stage == state.DONE) == 32, 1, 32)
                 status.waiting = queue.count_lanes(s.stage != state.FLIGHT)
 
             # ---- Surfaces: the warp traces its rays together
-            s.ray = next_ray(s)
-            ray = ray_geometry(s)
+            ray = next_ray(s, wp.static(used))
             if s.ray != state.NO_RAY and s.walk.node == NO_NODE:
                 s.walk.node = 0
                 s.walk.found = -1

@@ -9,9 +9,9 @@ from spadwarp_kernels.estimators.estimator import Direction
 from spadwarp_kernels.optics.sea import FACETS, sample_passage
 from spadwarp_kernels.photon import state
 from spadwarp_kernels.photon.spec import TransportSpec
-from spadwarp_kernels.photon.state import Draws, Launch, PhotonRef, SinkRef, WorldRef
+from spadwarp_kernels.photon.state import Launch, PhotonRef, PhotonState, SinkRef, WorldRef
 from spadwarp_kernels.riders.riders import make_rider
-from spadwarp_kernels.surface.bvh import NOWHERE, segment_meets_box
+from spadwarp_kernels.surface.bvh import NO_NODE, NOWHERE, segment_meets_box
 from spadwarp_kernels.surface.patches import nearest_patch
 from spadwarp_kernels.surface.ray_cast import intersect_surfaces, offset_from_surface, patch_hit
 from spadwarp_kernels.surface.reflectance import (
@@ -28,20 +28,26 @@ from spadwarp_kernels.water import limits
 
 
 def make_prepare(stepped: bool, in_blocks: bool, cuda: bool) -> wp.Function:
-    """The Warp function ``(draws, world, thread, launch) -> int``: readies the random numbers of a thread; its slot of
-    the ledger."""
+    """The Warp function ``(world, thread, launch) -> PhotonState`` of a thread before its first photon."""
 
     @wp.func
-    def prepare(draws: wp.ref[Draws], world: WorldRef, thread: int, launch: Launch) -> int:
+    def prepare(world: WorldRef, thread: int, launch: Launch) -> PhotonState:
         if wp.static(in_blocks):
             world.derivatives.blocks.thread = thread
-        draws.base = launch.first_id
+        s = PhotonState()
+        s.stage = state.START
+        s.account.slot = thread if wp.static(cuda) else slot_of_core(launch.first_id)
+        s.base = launch.first_id
         if wp.static(stepped):
-            draws.base += launch.offset[0]
-        draws.keys = philox.hold_keys(world.keys)
-        if wp.static(cuda):
-            return thread
-        return slot_of_core(launch.first_id)
+            s.base += launch.offset[0]
+        s.first = -1
+        s.taken = 32
+        s.albedo = world.medium.albedo
+        s.view = world.camera.view
+        s.target = -1
+        s.hit.face = -1  # for good where there is no mesh: so a compiler leaves out what is done on faces
+        s.walk.node = NO_NODE
+        return s
 
     return prepare
 
@@ -160,27 +166,24 @@ def make_meet(choose: wp.Function | None) -> wp.Function:
 def make_fly(
     spec: TransportSpec, plan_flight: wp.Function | None, meet: wp.Function, random_albedo: bool, cuda: bool
 ) -> wp.Function:
-    """The Warp function ``(s, world, draws, words)``: lets a photon fly, to EVENT or, where a tree of faces may be
-    in its way, to RAY.
-
-    On a CPU `words`, PREFETCHED_WORDS of them, keep the random words of the photon's next flights. They are drawn for
-    several flights at once, so that it must be called for each flight of a photon in turn.
-    """
+    """The Warp function ``(s, world, words)``: lets a photon fly, to EVENT or, where a tree of faces may be in its way,
+    to RAY. On a CPU `words`, PREFETCHED_WORDS of them, keep the random words of the photon's next flights. They are
+    drawn for several flights at once, so that it must be called for each flight of a photon in turn."""
     plans, tried, surface = plan_flight is not None, spec.faces.tried, spec.sight.sea or FACETS
     events, prefetch = philox.make_prefetch(philox.STREAM_TRANSPORT, *([philox.STREAM_FLIGHT_SAMPLE] if plans else []))
     last = events - 1
     has_bvh, sea = spec.faces.mesh and not tried, spec.sight.sea is not None
 
     @wp.func
-    def fly(s: PhotonRef, world: WorldRef, draws: wp.ref[Draws], words: wp.array[int]):
-        id = draws.base + wp.uint64(s.photon)
+    def fly(s: PhotonRef, world: WorldRef, words: wp.array[int]):
+        id = s.base + wp.uint64(s.photon)
         event = wp.uint32(s.collisions + 1)
         if wp.static(cuda):
-            s.flight.block = random_block_keyed(draws.keys, id, event, philox.STREAM_TRANSPORT)
+            s.flight.block = random_block_keyed(world.keys, id, event, philox.STREAM_TRANSPORT)
         else:
             k = s.collisions & last
             if k == 0:
-                prefetch(words, draws.keys, id, event)
+                prefetch(words, world.keys, id, event)
             s.flight.block = philox.prefetched_block(words, k)
         seed = join_words(s.flight.block[0], s.flight.block[2])
         xi = u01_tail(s.flight.block[0], s.flight.block[2])
@@ -193,7 +196,7 @@ def make_fly(
         s.flight.reach = wp.min(s.flight.distance, limit)
         if wp.static(plans):
             if wp.static(cuda):
-                s.flight.sample_block = random_block_keyed(draws.keys, id, event, philox.STREAM_FLIGHT_SAMPLE)
+                s.flight.sample_block = random_block_keyed(world.keys, id, event, philox.STREAM_FLIGHT_SAMPLE)
             else:
                 s.flight.sample_block = philox.prefetched_block(words, events + k)
             plan = plan_flight(s, s.flight.sample_block, world)
@@ -206,7 +209,7 @@ def make_fly(
         s.flight.factor = 1.0
         s.stage = state.EVENT
         if wp.static(random_albedo):
-            s.albedo = world.medium.albedo * u01(random_block_keyed(draws.keys, id, event, philox.STREAM_ROULETTE)[1])
+            s.albedo = world.medium.albedo * u01(random_block_keyed(world.keys, id, event, philox.STREAM_ROULETTE)[1])
         if wp.static(has_bvh):
             if segment_meets_box(s.x, s.u, s.flight.reach, world.surfaces.lower, world.surfaces.upper):
                 s.stage = state.RAY
@@ -251,10 +254,8 @@ class Collision:
 
 def make_collide(spec: TransportSpec, chosen: bool, flies_on: bool, score_flux: wp.Function | None) -> wp.Function:
     """The Warp function ``(s, world, sink)``: takes a photon to the end of its flight, and on to SCATTER or to END.
-
-    `chosen`: an estimator chooses what ends a flight; `flies_on`: see `make_continues`; `score_flux`: see
-    `make_flux_score`.
-    """
+    `chosen`: an estimator chooses what ends a flight; `flies_on`: see `continues`; `score_flux`: see
+    `make_flux_score`."""
     domain, rider, sea = spec.domain, make_rider(spec), spec.sight.sea is not None
     reflects, bounded = domain.reflects, domain.bounded and not domain.reflects
     tallies_flux = score_flux is not None
@@ -277,15 +278,14 @@ def make_collide(spec: TransportSpec, chosen: bool, flies_on: bool, score_flux: 
                 c.distance = wp.min(c.distance, leaves.distance)
         if wp.static(reflects):
             # By distance: a photon that has been reflected may be outside by a rounding error.
-            exit = domain.exit_distance(world.limits, s.x, s.u)
-            if exit < c.distance:
-                c.distance = exit
+            leaves = domain.exit(world.limits, s.x, s.u)
+            if leaves.distance < c.distance:
+                c.distance = leaves.distance
                 c.reason = -1
-                face = domain.exit(world.limits, s.x, s.u).face
-                if limits.face_index(world.limits.boundary, face) > 0.0:
-                    c.mirror = face
+                if limits.face_index(world.limits.boundary, leaves.face) > 0.0:
+                    c.mirror = leaves.face
                 else:
-                    c.reason = ledger.EXIT + face
+                    c.reason = ledger.EXIT + leaves.face
         if wp.static(sea):
             if c.reason < 0 and s.hit.face < 0 and s.flight.distance == s.flight.sea:
                 c.mirror = state.SEA_FACE
@@ -370,10 +370,8 @@ class Outcome:
 
 
 def make_sample_direction(spec: TransportSpec, direct: wp.Function | None) -> wp.Function:
-    """The Warp function ``(s, reflected, lobe, world, id) -> Direction``.
-
-    Directions follow the phase function and the surface's law, unless an estimator has a way of its own.
-    """
+    """The Warp function ``(s, reflected, lobe, world, id) -> Direction``. Directions follow the phase function and the
+    surface's law, unless an estimator has a way of its own."""
     if direct is not None:
         return direct
     water = spec.water
@@ -396,17 +394,11 @@ def make_sample_direction(spec: TransportSpec, direct: wp.Function | None) -> wp
     return sample_direction
 
 
-def make_continues(flies_on: bool) -> wp.Function:
-    """The Warp function ``reason -> bool``: whether there is a flight after an event.
-
-    `flies_on`: the light of a history's last event is scored as it flies, to where the next event would be.
-    """
-
-    @wp.func
-    def continues(reason: int) -> bool:
-        return reason < 0 or (wp.static(flies_on) and reason != ledger.ROULETTE)
-
-    return continues
+@wp.func
+def continues(reason: int, flies_on: bool) -> bool:
+    """Whether there is a flight after an event; `flies_on`: the light of a history's last event is scored as it flies,
+    to where the next event would be."""
+    return reason < 0 or (flies_on and reason != ledger.ROULETTE)
 
 
 def make_terminate(spec: TransportSpec) -> wp.Function:
@@ -432,11 +424,9 @@ def make_terminate(spec: TransportSpec) -> wp.Function:
 
 def make_lose(spec: TransportSpec, directed: bool, flies_on: bool) -> wp.Function:
     """The Warp function ``(s, world, sink, id, part, entry) -> bool``: a boundary sends on a part of the photon, and an
-    entry of the ledger takes the rest; whether there is a flight.
-
-    `directed`: weight and analog weight differ; `flies_on`: see `make_continues`.
-    """
-    terminate, continues = make_terminate(spec), make_continues(flies_on)
+    entry of the ledger takes the rest; whether there is a flight. `directed`: weight and analog weight differ;
+    `flies_on`: see `continues`."""
+    terminate = make_terminate(spec)
 
     @wp.func
     def lose(s: PhotonRef, world: WorldRef, sink: SinkRef, id: wp.uint64, part: float, entry: int) -> bool:
@@ -452,7 +442,7 @@ def make_lose(spec: TransportSpec, directed: bool, flies_on: bool) -> wp.Functio
         s.weight = new.weight
         s.analog_weight = new.analog_weight
         s.reason = new.reason
-        return continues(new.reason)
+        return continues(new.reason, wp.static(flies_on))
 
     return lose
 
@@ -502,13 +492,11 @@ def make_meet_sea(spec: TransportSpec, lose: wp.Function) -> wp.Function:
 
 
 def make_scatter(spec: TransportSpec, direct: wp.Function | None, flies_on: bool) -> wp.Function:
-    """The Warp function ``(s, world, sink, draws)``: takes a photon from its event to FLIGHT, or to END.
-
-    `flies_on`: see `make_continues`.
-    """
+    """The Warp function ``(s, world, sink)``: takes a photon from its event to FLIGHT, or to END. `flies_on`: see
+    `continues`."""
     directed, sea, rider = direct is not None, spec.sight.sea is not None, make_rider(spec)
     sample_direction, terminate = make_sample_direction(spec, direct), make_terminate(spec)
-    continues, lose = make_continues(flies_on), make_lose(spec, directed, flies_on)
+    lose = make_lose(spec, directed, flies_on)
     bounce, meet_sea = make_bounce(spec, lose), make_meet_sea(spec, lose)
 
     @wp.func
@@ -556,7 +544,7 @@ def make_scatter(spec: TransportSpec, direct: wp.Function | None, flies_on: bool
             new.weight.value *= survival[0]
         new.analog_weight = wp.where(wp.static(directed), s.analog_weight * survival[0], new.weight.value)
         terminate(new, s, world, sink, id)
-        if continues(new.reason):
+        if continues(new.reason, wp.static(flies_on)):
             turn(new, s, world, sink, id, on_surface, survival[1])
         s.weight = new.weight
         s.analog_weight = new.analog_weight
@@ -564,10 +552,10 @@ def make_scatter(spec: TransportSpec, direct: wp.Function | None, flies_on: bool
         s.surface_count += wp.where(on_surface, 1, 0)
 
     @wp.func
-    def scatter(s: PhotonRef, world: WorldRef, sink: SinkRef, draws: wp.ref[Draws]):
+    def scatter(s: PhotonRef, world: WorldRef, sink: SinkRef):
         # Here, not in `collide`: there a select takes the place of the branch, and a core waits for the flight.
         s.collisions += 1
-        id = draws.base + wp.uint64(s.photon)
+        id = s.base + wp.uint64(s.photon)
         bounced = False
         if wp.static(spec.domain.reflects):
             bounced = s.bounces.face > 0
@@ -579,6 +567,6 @@ def make_scatter(spec: TransportSpec, direct: wp.Function | None, flies_on: bool
                 meet_sea(s, world, sink, id)
         if not bounced:
             collision(s, world, sink, id)
-        s.stage = wp.where(continues(s.reason), state.FLIGHT, state.END)
+        s.stage = wp.where(continues(s.reason, wp.static(flies_on)), state.FLIGHT, state.END)
 
     return scatter

@@ -19,9 +19,9 @@ from numpy.typing import ArrayLike, NDArray
 
 from spadwarp_kernels.base import check
 from spadwarp_kernels.base.check import ArgumentError
-from spadwarp_kernels.base.native import load_float, load_vec2
+from spadwarp_kernels.base.native import fill, load_float, load_vec2
 from spadwarp_kernels.base.philox import begin_sequence, sequence_word, step_sequence, u01, u01_open
-from spadwarp_kernels.base.rotations import inverse_direction, inverse_of
+from spadwarp_kernels.base.rotations import inverse_direction
 
 from .medium import Grid, Layers, Medium, Profile, ProfileSample, Water, mixture_shares
 
@@ -33,11 +33,13 @@ LARGEST_CELL_COUNT = 1 << 30
 
 @wp.struct
 class GridLine:
-    """A line x + t u through the cells of a grid."""
+    """A line x + t u through the cells of a grid, or through blocks of them."""
 
     # begin, end: t at which it enters and leaves the box, within [0, length] [m]; begin >= end where it misses it
     begin: float
     end: float
+    p: wp.vec3  # p, d: x and u in cells
+    d: wp.vec3
     inverse: wp.vec3  # inverse, shift: the plane of number k across an axis is met at t = k inverse + shift
     shift: wp.vec3
     first: wp.vec3  # the cell in which it begins
@@ -50,29 +52,30 @@ class GridPlace:
     """A place on a line."""
 
     t: float  # where the cell begins, or a place within it [m]
-    leave: float  # where the line leaves the cell [m]
+    leave: float  # where the line leaves the cell, or ends [m]
     cell: int  # its index
     ahead: wp.vec3  # numbers of the planes that the line meets next, by axis
     at: wp.vec3  # where it meets them [m]
 
 
 @wp.func
-def grid_line(grid: Grid, x: wp.vec3, u: wp.vec3, length: float) -> GridLine:
-    """The part of the line x + t u, 0 <= t <= length, in the box."""
+def grid_line(grid: Grid, size: wp.vec3i, edge: int, x: wp.vec3, u: wp.vec3, length: float) -> GridLine:
+    """The part of the line x + t u, 0 <= t <= length, in the box; by so many blocks with an edge of so many cells."""
     line = GridLine()
-    size = grid.size
-    p = grid.turn * x + grid.shift
-    d = grid.turn * u
-    line.inverse = inverse_direction(d)
-    line.shift = -wp.cw_mul(p, line.inverse)
+    line.p = grid.turn * x + grid.shift
+    line.d = grid.turn * u
+    inverse = inverse_direction(line.d)
+    line.shift = -wp.cw_mul(line.p, inverse)
     line.end = length
     for i in range(3):
         low = line.shift[i]
-        high = float(size[i]) * line.inverse[i] + line.shift[i]
+        high = float(grid.size[i]) * inverse[i] + line.shift[i]
         line.begin = wp.max(line.begin, wp.min(low, high))
         line.end = wp.min(line.end, wp.max(low, high))
+    cells = float(edge)
     for i in range(3):
-        line.first[i] = wp.clamp(wp.floor(p[i] + line.begin * d[i]), 0.0, float(size[i] - 1))
+        line.first[i] = wp.clamp(wp.floor((line.p[i] + line.begin * line.d[i]) / cells), 0.0, float(size[i] - 1))
+    line.inverse = cells * inverse
     line.stride = wp.vec3i(
         wp.where(line.inverse[0] > 0.0, size[1] * size[2], -size[1] * size[2]),
         wp.where(line.inverse[1] > 0.0, size[2], -size[2]),
@@ -99,7 +102,7 @@ def first_place(line: GridLine, size: wp.vec3i) -> GridPlace:
         wp.where(line.inverse[2] > 0.0, line.first[2] + 1.0, line.first[2]),
     )
     place.at = wp.cw_mul(place.ahead, line.inverse) + line.shift
-    place.leave = wp.min(place.at[0], wp.min(place.at[1], place.at[2]))
+    place.leave = wp.min(wp.min(place.at[0], line.end), wp.min(place.at[1], place.at[2]))
     return place
 
 
@@ -116,7 +119,7 @@ def next_place(line: GridLine, here: GridPlace) -> GridPlace:
         wp.where(x or y, here.ahead[2], here.ahead[2] + _sign(line.inverse[2])),
     )
     place.at = wp.cw_mul(place.ahead, line.inverse) + line.shift
-    place.leave = wp.min(place.at[0], wp.min(place.at[1], place.at[2]))
+    place.leave = wp.min(wp.min(place.at[0], line.end), wp.min(place.at[1], place.at[2]))
     stride = wp.where(x, line.stride[0], wp.where(y, line.stride[1], line.stride[2]))
     # Rounding may let a line leave the box a step late: no index leaves the arrays.
     place.cell = wp.clamp(here.cell + stride, 0, line.last)
@@ -144,86 +147,6 @@ def cell_on_line(grid: Grid, p: wp.vec3, d: wp.vec3, t: float) -> int:
     return wp.max((i * grid.size[1] + j) * grid.size[2] + k, 0)
 
 
-@wp.struct
-class BlockLine:
-    """A line x + t u through the blocks of a grid."""
-
-    # begin, end: t at which it enters and leaves the box, within [0, length] [m]; begin >= end where it misses it
-    begin: float
-    end: float
-    p: wp.vec3  # p, d: x and u in cells
-    d: wp.vec3
-    step: wp.vec3  # by which t rises through a block, by axis [m]
-    stride: wp.vec3i  # what a step along each axis adds to the index of the block
-
-
-@wp.struct
-class BlockPlace:
-    """A place on a line."""
-
-    t: float  # where it is [m]
-    stop: float  # where it leaves the block, or the line ends [m]
-    block: int  # index of the block
-    at: wp.vec3  # where the line meets the next planes between blocks, by axis [m]
-
-
-@wp.func
-def block_line(grid: Grid, x: wp.vec3, u: wp.vec3, length: float) -> BlockLine:
-    """The part of the line x + t u, 0 <= t <= length, in the box."""
-    line = BlockLine()
-    line.p = grid.turn * x + grid.shift
-    line.d = grid.turn * u
-    line.end = length
-    for i in range(3):
-        inverse = inverse_of(line.d[i])
-        low = -line.p[i] * inverse
-        high = (float(grid.size[i]) - line.p[i]) * inverse
-        line.begin = wp.max(line.begin, wp.min(low, high))
-        line.end = wp.min(line.end, wp.max(low, high))
-        line.step[i] = float(grid.block_edge) * wp.abs(inverse)
-    row = grid.block_size[2]
-    layer = grid.block_size[1] * row
-    line.stride = wp.vec3i(
-        wp.where(line.d[0] < 0.0, -layer, layer), wp.where(line.d[1] < 0.0, -row, row), wp.where(line.d[2] < 0.0, -1, 1)
-    )
-    return line
-
-
-@wp.func
-def first_block(grid: Grid, line: BlockLine) -> BlockPlace:
-    """Where a line that meets the box enters it."""
-    place = BlockPlace()
-    place.t = line.begin
-    edge = float(grid.block_edge)
-    for i in range(3):
-        number = wp.clamp(wp.floor((line.p[i] + line.begin * line.d[i]) / edge), 0.0, float(grid.block_size[i] - 1))
-        place.block = place.block * grid.block_size[i] + int(number)
-        plane = edge * wp.where(line.d[i] < 0.0, number, number + 1.0)
-        place.at[i] = (plane - line.p[i]) * inverse_of(line.d[i])
-    place.stop = wp.min(wp.min(place.at[0], line.end), wp.min(place.at[1], place.at[2]))
-    return place
-
-
-@wp.func
-def next_block(grid: Grid, line: BlockLine, here: BlockPlace) -> BlockPlace:
-    """Where the line enters the next block; planes are counted by steps, since blocks are few."""
-    place = here
-    place.t = here.stop
-    x = here.at[0] <= here.stop
-    y = not x and here.at[1] <= here.stop
-    z = not x and not y
-    place.at = wp.vec3(
-        wp.where(x, here.at[0] + line.step[0], here.at[0]),
-        wp.where(y, here.at[1] + line.step[1], here.at[1]),
-        wp.where(z, here.at[2] + line.step[2], here.at[2]),
-    )
-    stride = wp.where(x, line.stride[0], wp.where(y, line.stride[1], line.stride[2]))
-    # Rounding may let a line leave the box a step late: no index leaves the arrays.
-    place.block = wp.clamp(here.block + stride, 0, grid.block_majorant.shape[0] - 1)
-    place.stop = wp.min(wp.min(place.at[0], line.end), wp.min(place.at[1], place.at[2]))
-    return place
-
-
 # ---- Flights.
 
 
@@ -237,7 +160,7 @@ def _over(depth: float, extinction: float) -> float:
 def depth_along(medium: Medium, layers: Layers, x: wp.vec3, u: wp.vec3, length: float) -> float:
     """Optical depth of the cells between x and x + length u."""
     grid = layers.grid
-    line = grid_line(grid, x, u, length)
+    line = grid_line(grid, grid.size, 1, x, u, length)
     if line.begin >= line.end:
         return medium.extinction * length
     depth = medium.extinction * (length - (line.end - line.begin))
@@ -252,20 +175,18 @@ def depth_along(medium: Medium, layers: Layers, x: wp.vec3, u: wp.vec3, length: 
 def distance_to(medium: Medium, layers: Layers, x: wp.vec3, u: wp.vec3, depth: float) -> float:
     """Distance [m] from x along u to an optical depth of the cells; 1e30: there is none."""
     grid = layers.grid
-    line = grid_line(grid, x, u, 1.0e30)
+    line = grid_line(grid, grid.size, 1, x, u, 1.0e30)
     before = medium.extinction * line.begin
     if line.begin >= line.end or depth <= before:
         return _over(depth, medium.extinction)
     rest = depth - before
     place = first_place(line, grid.size)
     extinction = float(grid.extinction[place.cell])
-    leave = wp.min(place.leave, line.end)
-    while extinction * (leave - place.t) < rest and leave < line.end:
-        rest -= extinction * (leave - place.t)
+    while extinction * (place.leave - place.t) < rest and place.leave < line.end:
+        rest -= extinction * (place.leave - place.t)
         place = next_place(line, place)
         extinction = grid.extinction[place.cell]
-        leave = wp.min(place.leave, line.end)
-    kept = extinction * (leave - place.t)
+    kept = extinction * (place.leave - place.t)
     if kept < rest:
         return line.end + _over(rest - kept, medium.extinction)
     return wp.min(place.t + _over(rest, extinction), line.end)
@@ -287,7 +208,7 @@ def draw_by_cells(
             sample.s = wp.min(distance_to(medium, layers, x, u, -wp.log(1.0 - xi * kept)), width)
     # Its cell by the walk that drew it. A face belongs to the cell behind it, since what is drawn next to the face of a
     # dense cell rounds to it.
-    line = grid_line(layers.grid, x, u, width)
+    line = grid_line(layers.grid, layers.grid.size, 1, x, u, width)
     sample.extinction = medium.extinction
     sample.depth = medium.extinction * sample.s
     if line.begin < line.end and line.begin <= sample.s:
@@ -356,25 +277,25 @@ def regular_extinction(medium: Medium, layers: Layers, x: wp.vec3, u: wp.vec3, l
 def delta_free_path(medium: Medium, layers: Layers, x: wp.vec3, u: wp.vec3, xi: float, seed: wp.uint64) -> float:
     """Free flight [m] by delta tracking: from xi the first tentative collision, from the seed the others."""
     grid = layers.grid
-    line = block_line(grid, x, u, 1.0e30)
+    line = grid_line(grid, grid.block_size, grid.block_edge, x, u, 1.0e30)
     rest = -wp.log(xi)
     before = medium.extinction * line.begin
     if line.begin >= line.end or rest <= before:
         return _over(rest, medium.extinction)
     rest -= before
-    place = first_block(grid, line)
-    majorant = load_float(grid.block_majorant, place.block)
+    place = first_place(line, grid.block_size)
+    majorant = load_float(grid.block_majorant, place.cell)
     random = begin_sequence(seed)
     while place.t < line.end:
         # First through the blocks, then the collision: the lanes of a warp do either together.
-        while majorant * (place.stop - place.t) < rest and place.stop < line.end:
-            rest -= majorant * (place.stop - place.t)
-            place = next_block(grid, line, place)
-            majorant = load_float(grid.block_majorant, place.block)
-        kept = majorant * (place.stop - place.t)
+        while majorant * (place.leave - place.t) < rest and place.leave < line.end:
+            rest -= majorant * (place.leave - place.t)
+            place = next_place(line, place)
+            majorant = load_float(grid.block_majorant, place.cell)
+        kept = majorant * (place.leave - place.t)
         if kept < rest:
             return line.end + _over(rest - kept, medium.extinction)
-        place.t = wp.min(place.t + rest / wp.max(majorant, 1.0e-30), place.stop)
+        place.t = wp.min(place.t + rest / wp.max(majorant, 1.0e-30), place.leave)
         random = step_sequence(random)
         extinction = load_float(grid.extinction, cell_on_line(grid, line.p, line.d, place.t))
         if u01(sequence_word(random)) * majorant < extinction:
@@ -390,17 +311,17 @@ def ratio_extinction(medium: Medium, layers: Layers, x: wp.vec3, u: wp.vec3, len
     residual ratio tracking about an extinction near the mean of each block, with one rate: first all lanes of a warp go
     through blocks, then all look up cells."""
     grid = layers.grid
-    line = block_line(grid, x, u, length)
+    line = grid_line(grid, grid.block_size, grid.block_edge, x, u, length)
     if line.begin >= line.end:
         return medium.extinction
-    place = first_block(grid, line)
-    control = load_vec2(grid.block_control, place.block)
+    place = first_place(line, grid.block_size)
+    control = load_vec2(grid.block_control, place.cell)
     rate = float(control[1])
-    depth = medium.extinction * (length - (line.end - line.begin)) + control[0] * (place.stop - place.t)
-    while place.stop < line.end:
-        place = next_block(grid, line, place)
-        control = load_vec2(grid.block_control, place.block)
-        depth += control[0] * (place.stop - place.t)
+    depth = medium.extinction * (length - (line.end - line.begin)) + control[0] * (place.leave - place.t)
+    while place.leave < line.end:
+        place = next_place(line, place)
+        control = load_vec2(grid.block_control, place.cell)
+        depth += control[0] * (place.leave - place.t)
         rate = wp.max(rate, control[1])
     part = float(1.0)
     mean_step = 1.0 / wp.max(rate, 1.0e-30)
@@ -438,10 +359,10 @@ def make_grid(
     shares: ArrayLike = (),
     device: wp.DeviceLike = None,
 ) -> Grid:
-    """Cells for `Layers.grid` of a spec with a grid.
+    """Cells for `Layers.grid` of a spec with a grid. Raises `ArgumentError`.
 
     Args:
-        extinction: c [1/m] >= 0, `[x, y, z]`, along the box's own axes.
+        extinction: c [1/m] >= 0, `[x, y, z]`, along the box's own axes; up to 2^30 cells.
         albedo: In [0, 1], of the same shape.
         anisotropy: g in (-1, 1), of the same shape; None: the medium's.
         size: Edges of the box [m].
@@ -450,12 +371,10 @@ def make_grid(
         block_edge: Cells along the edges of the blocks that delta tracking flies through; None: 6 blocks along the
             longest edge, the fastest for 128^3 cells on an H200.
         shares: Of mixtures, `[x, y, z, constituent]`, see `mixture_shares`.
-
-    Raises:
-        ArgumentError: Another shape, a number out of range, or more than 2^30 cells.
     """
     device = check.device("device", device)
     arrays = {"extinction": check.numbers("extinction", extinction, (None,) * 3, "[0, inf)").astype(np.float32)}
+    arrays["anisotropy"] = np.zeros(0, np.float32)
     shape = arrays["extinction"].shape
     check.integer("number of cells", math.prod(shape), 1, LARGEST_CELL_COUNT)
     arrays["albedo"] = check.numbers("albedo", albedo, shape, "[0, 1]").astype(np.float32)
@@ -470,26 +389,16 @@ def make_grid(
     edge_cells = max(1, math.ceil(longest / 6)) if block_edge is None else block_edge
     edge_cells = check.integer("block_edge", edge_cells, 1, longest)
 
-    grid = Grid()
     turn = (np.array(shape) / np.array(size, np.float64))[:, None] * axes.T
-    grid.turn = wp.mat33(*turn.ravel().tolist())
-    grid.shift = wp.vec3(*(0.5 * np.array(shape) - turn @ np.asarray(centre, np.float64)).tolist())
-    grid.size = wp.vec3i(*shape)
-    for name, array in arrays.items():
-        setattr(grid, name, wp.array(array.ravel(), dtype=float, device=device))
-    grid.shares = wp.array(mixture_shares(shares, shape), dtype=wp.vec4, device=device)
-    if anisotropy is None:
-        grid.anisotropy = wp.empty(0, dtype=float, device=device)
-    blocks = block_statistics(arrays["extinction"], edge_cells)
-    grid.block_edge = edge_cells
-    grid.block_size = wp.vec3i(*blocks[0].shape)
-    grid.block_majorant = wp.array(blocks[0].ravel(), dtype=float, device=device)
-    grid.block_control = wp.array(np.stack([b.ravel() for b in blocks[1:]], axis=1), dtype=wp.vec2, device=device)
-    mean = blocks[1]
+    shift = 0.5 * np.array(shape) - turn @ np.asarray(centre, np.float64)
+    majorant, mean, deviation = block_statistics(arrays["extinction"], edge_cells)
+    control, blocks = np.stack([mean.ravel(), deviation.ravel()], axis=1), majorant.shape
     for axis, count in enumerate(shape):
         mean = np.repeat(mean, edge_cells, axis=axis).take(range(count), axis=axis)
-    grid.residual = wp.array((arrays["extinction"] - mean).ravel(), dtype=float, device=device)
-    return grid
+    cells = {name: array.ravel() for name, array in arrays.items()} | {"shares": mixture_shares(shares, shape)}
+    grid = fill(Grid(), device, turn=turn, shift=shift, size=shape, **cells)
+    fill(grid, device, residual=(arrays["extinction"] - mean).ravel(), block_edge=edge_cells, block_size=blocks)
+    return fill(grid, device, block_majorant=majorant.ravel(), block_control=control)
 
 
 def block_statistics(extinction: NDArray[np.float32], edge: int) -> tuple[NDArray[np.float32], ...]:

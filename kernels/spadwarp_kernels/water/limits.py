@@ -12,11 +12,13 @@ import itertools
 from collections.abc import Sequence
 from typing import NamedTuple
 
+import numpy as np
 import warp as wp
 
 from spadwarp_kernels.base import check
 from spadwarp_kernels.base.check import ArgumentError
 from spadwarp_kernels.base.kernels import memoised
+from spadwarp_kernels.base.native import fill
 
 __all__ = ["Boundary", "Limits", "make_boundary"]
 
@@ -125,16 +127,13 @@ def image_reflectance(boundary: Boundary, image: wp.vec3i, u: wp.vec3) -> float:
 def make_boundary(
     low: Sequence[float], high: Sequence[float], *, max_reflections: int = 2, device: wp.DeviceLike = None
 ) -> Boundary:
-    """Faces that reflect, of a `reflecting` spec.
+    """Faces that reflect, of a `reflecting` spec. Raises `ArgumentError`.
 
     Args:
         low, high: Phase index outside the lower and the upper faces across x, y and z, over that of the water; 0 for a
             face that lets all light out, a very large number for a mirror.
         max_reflections: On the way from a scattering to the lens, 0 ... 8; more are left out. `analog` counts what it
             drops for this.
-
-    Raises:
-        ArgumentError: A number out of range, or all faces let light out.
     """
     sides = [check.numbers(name, one, (3,), "[0, 1e9]").tolist() for name, one in (("low", low), ("high", high))]
     most = check.integer("max_reflections", max_reflections, 0, 8)
@@ -147,11 +146,8 @@ def make_boundary(
     ]
     chains = [chain for chain in itertools.product(*numbers) if 0 < sum(map(abs, chain)) <= most]
     images = sorted(chains, key=lambda chain: (sum(map(abs, chain)), chain))
-    boundary = Boundary()
-    boundary.low, boundary.high = (wp.vec3(*indices) for indices in sides)
-    boundary.images = wp.array(images, dtype=wp.vec3i, device=check.device("device", device), shape=len(images))
-    boundary.max_reflections = most
-    return boundary
+    ways, device = np.reshape(images, (-1, 3)).astype(np.int32), check.device("device", device)
+    return fill(Boundary(), device, low=sides[0], high=sides[1], images=ways, max_reflections=most)
 
 
 # ---- The box and the limits.
@@ -226,7 +222,6 @@ class Domain(NamedTuple):
     turn_back: wp.Function  # the inverse
     is_outside: wp.Function  # ``(limits, x) -> bool``, outside the domain or beyond the lateral limit
     exit: wp.Function  # ``(limits, x, u) -> Exit``, of what a ray meets first
-    exit_distance: wp.Function  # ``(limits, x, u) -> float``, the distance of that [m]
     within: wp.Function  # ``(limits, length, x, u) -> float``, the part of a flight in a bounded domain [m]
     bounded: bool
     rotated: bool
@@ -275,12 +270,8 @@ def make_domain(bounded: bool, rotated: bool, reflects: bool) -> Domain:
         return next_face(limits, to_sides(limits, x, u), point(limits, x), turn(limits, u))
 
     @wp.func
-    def exit_distance(limits: Limits, x: wp.vec3, u: wp.vec3) -> float:
-        return exit(limits, x, u).distance
-
-    @wp.func
     def within(limits: Limits, length: float, x: wp.vec3, u: wp.vec3) -> float:
-        return wp.min(length, exit_distance(limits, x, u)) if wp.static(bounded) else length
+        return wp.min(length, exit(limits, x, u).distance) if wp.static(bounded) else length
 
     axes = (point, point_back, turn, turn_back)
-    return Domain(*axes, is_outside, exit, exit_distance, within, bounded, rotated, reflects)
+    return Domain(*axes, is_outside, exit, within, bounded, rotated, reflects)

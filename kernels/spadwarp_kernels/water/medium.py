@@ -15,6 +15,7 @@ import warp as wp
 from numpy.typing import ArrayLike, NDArray
 
 from spadwarp_kernels.base import check
+from spadwarp_kernels.base.native import fill
 from spadwarp_kernels.base.rotations import OFF_AXIS
 from spadwarp_kernels.base.tables import DensityTables
 
@@ -35,30 +36,23 @@ class Medium:
     axis_threshold: float
     """|u_z| from which a scattering takes u for the z axis (the near-axis rule), in (0, 1]; 1 switches it off, and
     functions of your own that the transport kernel calls then see 2."""
-    per_bit: float  # -ln(2)/c [m], 0 in vacuum; filled by `launch_transport`
     phase: DensityTables  # of TABULATED and of mixtures, from `make_phase_tables`; left alone otherwise
     shares: wp.vec4  # of a mixture: the part of the scattering that is each constituent's; their sum is 1
 
 
 def make_medium(absorption: float, scattering: float, *, anisotropy: float = 0.0) -> Medium:
     """Water from its coefficients [1/m], 0 or more, with the mean cosine g of its phase function in (-1, 1).
-
-    Raises:
-        ArgumentError: A number out of range.
-    """
-    medium = Medium()
-    absorption = check.number("absorption", absorption, "[0, inf)")
+    Raises `ArgumentError`."""
     scattering = check.number("scattering", scattering, "[0, inf)")
-    medium.extinction = absorption + scattering
-    medium.albedo = scattering / medium.extinction if medium.extinction > 0.0 else 0.0
-    medium.anisotropy, medium.axis_threshold = check.number("anisotropy", anisotropy, "(-1, 1)"), 1.0
-    return medium
+    extinction = check.number("absorption", absorption, "[0, inf)") + scattering
+    g = check.number("anisotropy", anisotropy, "(-1, 1)")
+    albedo = scattering / extinction if extinction > 0.0 else 0.0
+    return fill(Medium(), extinction=extinction, albedo=albedo, anisotropy=g, axis_threshold=1.0)
 
 
 def ready_medium(copy: Medium, medium: Medium) -> None:
-    """Readies a copy for a kernel: a threshold of 1 is OFF_AXIS, and `per_bit` is filled."""
+    """Readies a copy for a kernel: a threshold of 1 is OFF_AXIS."""
     copy.axis_threshold = medium.axis_threshold if np.float32(medium.axis_threshold) < 1.0 else OFF_AXIS
-    copy.per_bit = -math.log(2.0) / medium.extinction if medium.extinction > 0.0 else 0.0
 
 
 @wp.func
@@ -68,18 +62,6 @@ def free_path(xi: float, extinction: float) -> float:
     if extinction <= 0.0:
         return 1.0e30
     return -wp.log(xi) / extinction
-
-
-@wp.func_native("""
-#if defined(__CUDA_ARCH__)
-    return medium.per_bit < 0.0f ? __log2f(xi) * medium.per_bit : 1.0e30f;
-#else
-    return medium.extinction > 0.0f ? -wp::log(xi) / medium.extinction : 1.0e30f;
-#endif
-""")
-def ready_free_path(xi: float, medium: Medium) -> float:
-    """`free_path` in a medium from `ready_medium`."""
-    ...
 
 
 # ---- Other wavelengths.
@@ -114,6 +96,7 @@ def make_lines(
     device: wp.DeviceLike = None,
 ) -> Lines:
     """Up to MOST_LINES lines, with the phase function of the medium for what is scattered later.
+    Raises `ArgumentError`.
 
     Args:
         source: Coefficients of the inelastic scattering [1/m], >= 0, `[water, line]`; the water's absorption has it. Of
@@ -125,9 +108,6 @@ def make_lines(
         media: The medium, or the waters of the layers, at the laser's wavelength; the scattering is above 0.
         elastic: The lines are of the laser, and light of a line is there from the start.
         delay: Group index at the line over that of the medium, by default 1.
-
-    Raises:
-        ArgumentError: A number out of range, or lists of several lengths.
     """
     device, lines, waters = check.device("device", device), Lines(), len(check.items("media", media))
     count = check.integer("number of lines", len(check.items("passed", passed)), 1, MOST_LINES)
@@ -149,11 +129,8 @@ def make_lines(
         columns[name] = check.numbers(name, np.atleast_2d(check.numbers(name, row)), (waters, count), within)
     columns["more"] = columns.pop("extinction") - np.array([[one.extinction] for one in media])
     columns["again"] = columns.pop("scattering") / np.array(b)[:, None]
-    for name, column in columns.items():
-        filled = np.zeros((waters, MOST_LINES), np.float32)
-        filled[:, :count] = column
-        setattr(lines, name, wp.array(filled, dtype=wp.vec4, device=device))
-    return lines
+    filled = {name: np.pad(column, ((0, 0), (0, MOST_LINES - count))) for name, column in columns.items()}
+    return fill(lines, device, **filled)
 
 
 # ---- Layers.
@@ -171,8 +148,7 @@ class Grid:
     size: wp.vec3i  # number of cells along the three edges
     extinction: wp.array[float]  # c [1/m] by cell, the last edge fastest
     albedo: wp.array[float]  # single-scattering albedo in [0, 1]
-    anisotropy: wp.array[float]
-    """g in (-1, 1), for phase functions that use the medium's; empty: the medium's everywhere."""
+    anisotropy: wp.array[float]  # g in (-1, 1), if the phase function uses the medium's; empty: that everywhere
     block_edge: int  # cells along the edges of a block
     block_size: wp.vec3i  # number of blocks along the three edges of the box; the last may be incomplete
     block_majorant: wp.array[float]  # largest c in each block [1/m]
@@ -190,8 +166,7 @@ class Layers:
     """
 
     axis: wp.vec3  # unit vector
-    start: wp.array[float]
-    """Position along the axis, x·axis, at which each layer begins [m], ascending; the first is not read."""
+    start: wp.array[float]  # position x·axis at which each layer begins [m], ascending; the first is not read
     extinction: wp.array[float]  # c [1/m], > 0
     albedo: wp.array[float]  # single-scattering albedo in [0, 1]
     anisotropy: wp.array[float]  # g in (-1, 1), for phase functions that use the medium's
@@ -277,7 +252,7 @@ def layered_water(medium: Medium, layers: Layers, x: wp.vec3) -> Medium:
 
 @wp.func
 def _free_path(medium: Medium, layers: Layers, x: wp.vec3, u: wp.vec3, xi: float, seed: wp.uint64) -> float:
-    return ready_free_path(xi, medium)
+    return free_path(xi, medium.extinction)
 
 
 @wp.func
@@ -364,9 +339,4 @@ def make_layers(
     for k in range(2, count):
         check.number(f"start[{k}]", start[k], f"[{float(start[k - 1])}, inf)")
     check.vector("axis", axis, unit=True)
-    layers = Layers()
-    layers.axis = wp.vec3(*axis)
-    layers.shares = wp.array(mixture_shares(shares, (len(start),)), dtype=wp.vec4, device=device)
-    for name, column in columns.items():
-        setattr(layers, name, wp.array(column, dtype=float, device=device))
-    return layers
+    return fill(Layers(), device, axis=axis, shares=mixture_shares(shares, (len(start),)), **columns)

@@ -62,13 +62,13 @@ def test_the_way_to_a_point_inside_is_the_one_that_rays_find(name, device):
         x, o = x[beyond], o[beyond]
     found = each(kind.connect, [port, x, o], [Connection], device)
     seen_from = each(kind.apparent, [port, x, o, on_device(found, device, Connection)], [wp.vec3], device)
-    limits = dict(to_port=4e-7, inside=2e-6, water=4e-7, path=5e-7, transmission=2e-6, density=1e-5)
+    limits = dict(to_lens=4e-7, inside=2e-6, water=4e-7, path=5e-7, transmission=2e-6, density=1e-5)
     limits |= dict(exit=1e-6, seen_from=1e-6)
     worst = dict.fromkeys(limits, 0.0)
     for k in range(len(x)):
         p, lens = x[k].astype(np.float64), o[k].astype(np.float64)
         # Rays through oil bend less, rays through air more than the straight line: any start does.
-        start = found["to_port"][k].astype(np.float64)
+        start = found["to_lens"][k].astype(np.float64)
         assert np.linalg.norm(start) == pytest.approx(1.0, abs=1e-5)
         u, v, lengths, through, density = refraction.connect(faces, n, p, lens, start / np.linalg.norm(start))
         path, straight = np.dot(lengths, group) / group[0], np.linalg.norm(p - lens)
@@ -76,7 +76,7 @@ def test_the_way_to_a_point_inside_is_the_one_that_rays_find(name, device):
         steep = -v @ normal > np.cos(np.radians(75))
         assert not steep or -float(port.early) - 1e-7 <= path - straight <= float(port.late) + 1e-7
         errors = {
-            "to_port": np.abs(found["to_port"][k] - u).max(),
+            "to_lens": np.abs(found["to_lens"][k] - u).max(),
             "inside": np.abs(found["inside"][k] - v).max(),
             "water": abs(found["water"][k] - lengths[0]) / straight,
             "path": abs(found["path"][k] - path) / straight,

@@ -8,9 +8,9 @@ import warp as wp
 from helpers.brute_force import check_hits
 from helpers.launch import each, on_device, unit
 from helpers.meshes import mesh_of, soup
-from spadwarp_kernels.base.native import bits_of
+from spadwarp_kernels.base.native import bits_of, load_row
 from spadwarp_kernels.surface.mesh import Surfaces
-from spadwarp_kernels.surface.patches import load_row, nearest_patch, pack_patches, set_patches
+from spadwarp_kernels.surface.patches import nearest_patch, pack_patches, set_patches
 from spadwarp_kernels.surface.ray_cast import patch_hit
 
 SQUARE = np.array([[0, 0, 0], [1, 0, 0], [1, 1, 0], [0, 1, 0]], float)
