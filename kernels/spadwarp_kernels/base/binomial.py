@@ -110,9 +110,12 @@ def _exact_log_ratio(k: wp.float64, mode: wp.float64, trials: wp.float64, odds: 
 def binomial(
     n: int, hazard: wp.float64, seed: wp.uint64, id: wp.uint64, purpose: wp.uint32, first_block: wp.uint32
 ) -> tuple[int, wp.uint32]:
-    """A count from Binomial(n, 1 − exp(−hazard)) and the first random block that it has not used. n in [0, 2^31),
-    hazard in [0, inf]. Inversion while the mean (of the rarer outcome) is below 10, above it transformed rejection with
-    squeeze, BTRS: W. Hörmann, "The generation of binomial random variates", J. Stat. Comput. Simul. 46, 101 (1993)."""
+    """A count from Binomial(n, 1 − exp(−hazard)) and the first random block that it has not used.
+
+    n in [0, 2^31), hazard in [0, inf]. Inversion while the mean (of the rarer outcome) is below 10, above it
+    transformed rejection with squeeze, BTRS: W. Hörmann, "The generation of binomial random variates", J. Stat. Comput.
+    Simul. 46, 101 (1993).
+    """
     block = wp.uint32(first_block)
     if n <= 0 or hazard <= ZERO:
         return 0, block
@@ -169,8 +172,11 @@ def binomial(
 
 @wp.func
 def count_quantile(z: float, pulses: float, alpha: float) -> float:
-    """The count of Binomial(pulses, 1 − exp(−alpha)) at the normal quantile z. Below a mean of 8 by inversion; above it
-    by the Cornish–Fisher expansion to the skewness, whose error in the distribution function is below 0.2 % there."""
+    """The count of Binomial(pulses, 1 − exp(−alpha)) at the normal quantile z.
+
+    Below a mean of 8 by inversion; above it by the Cornish–Fisher expansion to the skewness, whose error in the
+    distribution function is below 0.2 % there.
+    """
     p = 1.0 - wp.exp(-alpha)
     if alpha < 1.0e-3:
         p = alpha * (1.0 - 0.5 * alpha)

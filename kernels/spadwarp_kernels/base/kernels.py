@@ -34,9 +34,11 @@ if hasattr(os, "register_at_fork"):
 
 
 def memoised(make: Callable[P, R]) -> Callable[P, R]:
-    """`functools.cache` for what makes Warp functions and kernels: in all threads one after the other. Where two
-    threads make a function of one name, Warp may give both the later one, and a kernel is then made of the parts of
-    another."""
+    """`functools.cache` for what makes Warp functions and kernels: in all threads one after the other.
+
+    Where two threads make a function of one name, Warp may give both the later one, and a kernel is then made of the
+    parts of another.
+    """
     made = functools.cache(make)
 
     @functools.wraps(make)
@@ -53,9 +55,11 @@ def memoised(make: Callable[P, R]) -> Callable[P, R]:
 def launch_pixels(
     kernel: wp.Kernel, count: int, inputs: Sequence[Any], *, device: Any, threads: int = 0, block_dim: int = 256
 ) -> None:
-    """Launch a kernel over `count` pixels; its first argument is the first pixel of the launch, `inputs` follow. On the
-    CPU, where a launch runs on one core and releases the GIL, the pixels are shared out over threads (0: one for each
-    core); but not while a graph is captured, which records the launches of one thread."""
+    """Launch a kernel over `count` pixels; its first argument is the first pixel of the launch, `inputs` follow.
+
+    On the CPU, where a launch runs on one core and releases the GIL, the pixels are shared out over threads (0: one for
+    each core); but not while a graph is captured, which records the launches of one thread.
+    """
     device = wp.get_device(device)
     if count == 0:
         return

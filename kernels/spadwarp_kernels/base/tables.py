@@ -112,8 +112,10 @@ def table_sample(tables: DensityTables, row: int, xi: float) -> float:
 
 
 def folded_quadrature() -> tuple[Floats, Floats]:
-    """Folded coordinates and weights for an integral over [0, 1], `[2, cells of a half, 16]`, the upper half second. A
-    function may rise towards either end as y^-0.95."""
+    """Folded coordinates and weights for an integral over [0, 1], `[2, cells of a half, 16]`, the upper half second.
+
+    A function may rise towards either end as y^-0.95.
+    """
     node, weight = np.polynomial.legendre.leggauss(16)
     node, weight = 0.5 * node + 0.5, 0.5 * weight
     width = np.diff(_NODES)[:, None]
@@ -124,9 +126,11 @@ def folded_quadrature() -> tuple[Floats, Floats]:
 
 
 def tabulate(density: Callable[[Floats], Floats]) -> Floats:
-    """The cells of a density in float64, `[cells, 4]`, from a density of any scale over folded coordinates. Up to 2^-33
-    from an end the density is replaced by its mean there. Raises `ArgumentError` if it is negative, not finite or zero
-    everywhere."""
+    """The cells of a density in float64, `[cells, 4]`, from a density of any scale over folded coordinates.
+
+    Up to 2^-33 from an end the density is replaced by its mean there. Raises `ArgumentError` if it is negative, not
+    finite or zero everywhere.
+    """
     z, weight = folded_quadrature()
     values = check.numbers("density(t)", density(z), z.shape, "[0, inf)")
     if not values.any():

@@ -92,11 +92,13 @@ def make_sample_flight(guide: PhaseGuide = HENYEY_GREENSTEIN_GUIDE, profile: Pro
         layers: Layers,
         begin_point: wp.vec3,
     ) -> FlightSample:
-        """A point of the flight x + s u within the interval, x relative to the lens point. Half the points are drawn
-        from exp(-c s), with a profile from c(s) exp(-depth(s)), half in the angle theta(s) = atan2(D, t_c - s), D = |x
-        cross u|, by which the light must turn to reach the lens: from the guide, which follows the phase function; on
-        flights that lead away from the lens (s0 >= t_c) uniformly in tan(psi/2), psi = pi - theta, small far from the
-        lens."""
+        """A point of the flight x + s u within the interval, x relative to the lens point.
+
+        Half the points are drawn from exp(-c s), with a profile from c(s) exp(-depth(s)), half in the angle theta(s) =
+        atan2(D, t_c - s), D = |x cross u|, by which the light must turn to reach the lens: from the guide, which
+        follows the phase function; on flights that lead away from the lens (s0 >= t_c) uniformly in tan(psi/2), psi =
+        pi - theta, small far from the lens.
+        """
         sample = FlightSample()
         s0 = interval[0]
         s1 = interval[1]
@@ -328,9 +330,11 @@ def make_flight_point(spec: TransportSpec) -> wp.Function:
 @memoised
 def make_point_of(points: int) -> wp.Function:
     """The Warp function ``(request, number) -> Request``: of a flight, that of another of its `points`, at least 2.
+
     Both random numbers of a point are a part of 1 further than those of the one before, modulo 1: those of each are
     uniform, and together they are spread evenly (systematic sampling). What a pixel's bin holds is noisy above all
-    since few flights are scored in it; the points of a flight lie in others."""
+    since few flights are scored in it; the points of a flight lie in others.
+    """
     step = wp.uint32((1 << 32) // points)
 
     @wp.func
@@ -395,8 +399,10 @@ def _make_carry(spec: TransportSpec) -> wp.Function:
 
 @memoised
 def make_score(spec: TransportSpec, flights: bool = False) -> wp.Function:
-    """The Warp function ``(request, world) -> Scored`` of next events, with what rides along. `flights`: whether
-    requests may ask for a point of a flight."""
+    """The Warp function ``(request, world) -> Scored`` of next events, with what rides along.
+
+    `flights`: whether requests may ask for a point of a flight.
+    """
     reflects, collides, water = spec.domain.reflects, flights and spec.scores_collisions, spec.water
     flight_point, scattering_density = make_flight_point(spec), make_scattering(spec)
     sight, pose, sea, rider = spec.sight, spec.sight.pose, spec.sight.sea is not None, make_rider(spec)

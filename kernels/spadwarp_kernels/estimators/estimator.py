@@ -52,8 +52,10 @@ class Estimator(NamedTuple):
     meet: wp.Function | None = None
     """``(s, world, distance) -> Meeting``, whether the flight ends on the face at that distance [m], with another
     chance than in the physics."""
-    request_flight: wp.Function | None = None  # ``(s) -> Request``, the score of a flight with a planned interval
-    request_event: wp.Function | None = None  # ``(s, world) -> Request``, the score of the event that s has come to
+    request_flight: wp.Function | None = None
+    """``(s) -> Request``, the score of a flight whose planned interval is not empty."""
+    request_event: wp.Function | None = None
+    """``(s, world) -> Request``, the score of the event that the photon has come to."""
     score: wp.Function | None = None
     """``(request, world) -> Scored``; needed with either request. It delivers what rides along, see `Rider`."""
     direct: wp.Function | None = None

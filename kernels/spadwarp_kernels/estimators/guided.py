@@ -112,8 +112,11 @@ def make_choose_meeting(spec: TransportSpec) -> wp.Function:
 @wp.func
 def leads_aside(x: wp.vec3, u: wp.vec3) -> bool:
     """Whether light has to turn by more than 26 degrees (cosine 0.9) to reach the lens, from any point of the flight
-    from x along u: the angle is least at its first point. After a collision in the water such flights are a third of
-    what is scored; they bring weak, even scores, and next to nothing of the variance of bins where it is large."""
+    from x along u: the angle is least at its first point.
+
+    After a collision in the water such flights are a third of what is scored; they bring weak, even scores, and next to
+    nothing of the variance of bins where it is large.
+    """
     return wp.dot(x, u) > -0.9 * wp.length(x)
 
 

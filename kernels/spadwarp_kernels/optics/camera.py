@@ -26,7 +26,8 @@ class Camera:
     width: int  # of the image [pixels]
     height: int  # of the image [pixels]
     pixel_tangent: float  # pixel pitch over image distance
-    aperture_radius: float  # of the entrance pupil [m]; 0 makes the lens a point, which images all depths sharply
+    aperture_radius: float
+    """Radius of the entrance pupil [m]; 0 makes the lens a point, which images all depths sharply."""
     aperture_area: float  # the area that collects light [m^2], also where the lens is a point
     inverse_focus: float  # 1 over the depth that is imaged sharply [1/m]; 0 is infinity
     focal: wp.vec2
@@ -246,7 +247,7 @@ def make_camera(
     aperture_area: float | None = None,
     focus: float = math.inf,
 ) -> Camera:
-    """A camera whose numbers fit each other, see `Camera`. Raises `ArgumentError`.
+    """A camera whose numbers fit each other, see `Camera`.
 
     Args:
         width, height: Of the image [pixels].
@@ -254,6 +255,9 @@ def make_camera(
         aperture_radius: Of the lens [m]; 0 images all depths sharply, and needs `aperture_area`.
         aperture_area: That collects light [m^2]; by default, and within 1 % of it, that of the radius.
         focus: Depth that is imaged sharply [m].
+
+    Raises:
+        ArgumentError: A number out of range, or an area that is not that of the radius.
     """
     width, height = check.integer("width", width, 1), check.integer("height", height, 1)
     pixel_tangent = check.number("pixel_tangent", pixel_tangent, "(0, inf)")
@@ -270,7 +274,11 @@ def make_camera(
 
 
 def make_gate(bins: int, *, one_way_metres: tuple[float, float]) -> Gate:
-    """A gate of equal bins, so many, between two distances from the camera [m]. Raises `ArgumentError`."""
+    """A gate of equal bins, so many, between two distances from the camera [m].
+
+    Raises:
+        ArgumentError: A number out of range.
+    """
     check.vector("one_way_metres", one_way_metres, size=2)
     start = check.number("one_way_metres[0]", one_way_metres[0], "[0, inf)")
     stop = check.number("one_way_metres[1]", one_way_metres[1], f"({start}, inf)")

@@ -52,7 +52,7 @@ def make_laser(
     position: Sequence[float] = (0.0, 0.0, 0.0),
     axis: Sequence[float] = (0.0, 0.0, 1.0),
 ) -> Laser:
-    """A laser of one of LASER_PROFILES, in camera coordinates. Raises `ArgumentError`.
+    """A laser of one of LASER_PROFILES, in camera coordinates.
 
     Args:
         profile: "uniform_cone", "gaussian" or "collimated".
@@ -60,6 +60,9 @@ def make_laser(
         radius: Of a collimated beam [m]; 0 is a pencil beam.
         position: Of its exit pupil [m].
         axis: Of the beam, of any length but 0.
+
+    Raises:
+        ArgumentError: A number out of range, or one that the profile does not have.
     """
     check.choice("profile", profile, LASER_PROFILES)
     needed, other = ("radius", half_angle) if profile == "collimated" else ("half_angle", radius)
@@ -109,7 +112,7 @@ def emit_photon(laser: Laser, axis: wp.vec3, seed: wp.uint64, id: wp.uint64):
 
 
 def profile_tables(image: ArrayLike) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
-    """Distribution functions from which `emit_measured` draws a pixel of a beam profile. Raises `ArgumentError`.
+    """Distribution functions from which `emit_measured` draws a pixel of a beam profile.
 
     Args:
         image: Irradiance on a plane across the beam, `[H, W]`, any unit, >= 0, finite, not all 0.
@@ -117,6 +120,9 @@ def profile_tables(image: ArrayLike) -> tuple[NDArray[np.float32], NDArray[np.fl
     Returns:
         float32 `[H]`, the part of the power in the rows up to each; float32 `[H, W]`, the same along each row. The last
         entries are 1.
+
+    Raises:
+        ArgumentError: Another shape, or values that cannot be.
     """
     power = check.numbers("profile", image, (None, None), "[0, inf)")
     if not power.any():
@@ -226,7 +232,8 @@ class Scan:
 
     count: int  # number of positions; position i is scored into pixel i, or the row i of a receiver's pixels
     axis: wp.array[wp.vec3]  # unit vector of the beam at each
-    view: wp.array[wp.vec4]  # tangents (left, top, right, bottom) of a box that holds what each pixel sees
+    view: wp.array[wp.vec4]
+    """Tangents (left, top, right, bottom) of what each position's pixel sees; a box that holds it."""
     pose: wp.array[wp.transform]
     """From the frame of camera and laser at each shot to the frame of all else. With the lens `SCANNED`, which reads
     this alone: `Laser.axis` and `Camera.view` are those of every shot."""
@@ -268,7 +275,8 @@ def make_pose(moves: bool) -> Pose:
 class Beam(NamedTuple):
     """How photons start, as Warp functions."""
 
-    emit: wp.Function  # ``(laser, scan, seed, id) -> spatial_vector``: start [m], unit direction; of the camera's frame
+    emit: wp.Function
+    """``(laser, scan, seed, id) -> spatial_vector``: start [m], then unit direction, in the frame of the camera."""
     axis: wp.Function  # ``(laser, scan, target) -> vec3``, the beam's, for a position of the scan
     port: PortKind | None  # what is between the laser and the water
     scans: bool

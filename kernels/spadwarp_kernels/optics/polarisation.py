@@ -30,7 +30,8 @@ class Polarisation:
     channels: Channels
     """A row for each channel of the receiver, whose product with the Stokes vector it takes; with respect to the
     image's x, so that U is light at 45 degrees from x towards y less that at 135."""
-    facet_index: wp.array(dtype=float)  # of each face's specular facets over the water's; empty without them
+    facet_index: wp.array(dtype=float)
+    """Index of each face's specular facets over that of the water; empty without a specular lobe."""
 
 
 def matrix_cosines() -> NDArray[np.float64]:
@@ -49,7 +50,7 @@ def make_polarisation(
     facet_index: ArrayLike = (),
     device: wp.DeviceLike = None,
 ) -> Polarisation:
-    """Parameters of polarised light, for `Model.polarisation`. Raises `ArgumentError`.
+    """Parameters of polarised light, for `Model.polarisation`.
 
     Args:
         laser: Stokes vector of the emitted light, I = 1, see `Polarisation`.
@@ -57,6 +58,9 @@ def make_polarisation(
             `Elements`. None: light keeps its polarisation as it is turned.
         channels: Up to MOST_CHANNELS rows of four numbers; as many as the spec has.
         facet_index: Of each face, > 0; one number for each, or nothing.
+
+    Raises:
+        ArgumentError: Numbers that no light and no matrix can have.
     """
     device = check.device("device", device)
     stokes = check.numbers("laser", laser, (4,), "(-inf, inf)")

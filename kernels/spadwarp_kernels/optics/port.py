@@ -40,7 +40,8 @@ class Port:
     margin: float  # bound of how far a rough surface moves a line of sight aside, over the depth below it (sea)
     amplitude: float  # bound of the height of resolved waves above the plane, and of their depth below it [m] (sea)
     straight: float  # and of how far aside light gets on its way between them, without being refracted [m] (sea)
-    early: float  # the way through the port takes at most this much less than the straight line in water [m of water]
+    early: float
+    """The way through the port takes at most this much less than the straight line in water [m of water]."""
     late: float  # and at most this much more [m of water]
 
 
@@ -379,7 +380,8 @@ class PortKind(NamedTuple):
     cosines: wp.Function
     """Warp function (port, x, u) -> vec4, `PortRay.cosines` of the ray through x in the water along u, on its way in or
     out."""
-    apparent: wp.Function  # (port, x, o, connection) -> the point from where the light of o seems to come at x [m]
+    apparent: wp.Function
+    """Warp function (port, x, o, connection) -> the point from where the light of o seems to come at x [m]."""
 
 
 FLAT_PORT = PortKind("flat", *_make_ways(_plane_face, _aim_flat), _apparent_flat)
@@ -401,7 +403,7 @@ def make_flat_port(
     largest_angle: float = 1.5,
     sea: Any = None,
 ) -> Port:
-    """The parameters of a plane window. Raises `ArgumentError`.
+    """The parameters of a plane window.
 
     Args:
         distance: From the camera's lens centre along the normal to the inner face [m].
@@ -413,6 +415,9 @@ def make_flat_port(
         largest_angle: Between the normal and any ray of the view, inside, in [0, pi/2) [rad].
         sea: The surface of a sea, see `make_sea`, if the port is its mean plane; all of the lens must be farther away
             than its waves are high.
+
+    Raises:
+        ArgumentError: A number out of its range.
     """
     check.number("distance", distance, "(-inf, inf)")
     check.vector("normal", normal, unit=True)

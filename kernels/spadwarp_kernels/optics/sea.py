@@ -584,8 +584,10 @@ def unresolved_covariance(
     variances: Sequence[float], along: Sequence[float], heights: ArrayLike, size: Sequence[float]
 ) -> NDArray[np.float64]:
     """Covariance of the slopes that a height field leaves to facets, along its rows and from row to row, `[2, 2]`.
+
     `along`: the wind's direction along both, of any length; else as in `make_sea`. Raises `ArgumentError` where less
-    than a tenth of the variance on an axis is left."""
+    than a tenth of the variance on an axis is left.
+    """
     resolved = facet_covariance(heights, size)
     wind = np.array(along, np.float64) / math.hypot(*along)
     turn = np.array([wind, [-wind[1], wind[0]]])
@@ -615,7 +617,7 @@ def make_sea(
     origin: Sequence[float] = (0.0, 0.0, 0.0),
     device: wp.DeviceLike = None,
 ) -> Sea:
-    """The surface of the sea. Raises `ArgumentError`.
+    """The surface of the sea.
 
     Args:
         variances: Of all slopes along and across the wind, see `slope_variances`; both 0 for a flat surface.
@@ -631,6 +633,9 @@ def make_sea(
         columns: Direction along a row, of any length, not along the normal; default: that of the wind.
         origin: A point above or below the first node [m].
         device: Where the heights are stored.
+
+    Raises:
+        ArgumentError: A number out of its range.
     """
     check.vector("variances", variances, size=2)
     for k, variance in enumerate(variances):

@@ -75,9 +75,11 @@ def _near_depth_kernel(camera: Camera, view: wp.vec4, mesh: wp.uint64, threads: 
 
 def near_depth_map(mesh: wp.Mesh, camera: Camera, near_depth: wp.array | None = None) -> wp.array:
     """Least depth [m] at which a face of the mesh can stand in each part of the view, float32 [rows, columns], anew or
-    in place; raises `ArgumentError` for a camera that images nothing. A point of the view that lies before it is seen
-    from everywhere on the lens: the segments to the lens stay within the texel's cone, up to what the outlines of faces
-    are widened by, and before every face in it."""
+    in place; raises `ArgumentError` for a camera that images nothing.
+
+    A point of the view that lies before it is seen from everywhere on the lens: the segments to the lens stay within
+    the texel's cone, up to what the outlines of faces are widened by, and before every face in it.
+    """
     check.kind("mesh", mesh, wp.Mesh)
     check_camera("camera", camera, calibrated=False)
     shape = (int(_TEXELS), int(_TEXELS))
@@ -235,9 +237,12 @@ class LensSample:
 @memoised
 def make_sample_lens(port: PortKind | None) -> wp.Function:
     """The Warp function ``(camera, x, u, xi1, xi2) -> LensSample``: a point of the lens by which the flight x + s u is
-    scored. The score goes with 1/D, D its distance from the flight's line. Where this, refracted by a port, passes the
-    lens, the point is drawn with that density, uniform in angle and distance about the place: even draws would have no
-    finite variance. Else it is even."""
+    scored.
+
+    The score goes with 1/D, D its distance from the flight's line. Where this, refracted by a port, passes the lens,
+    the point is drawn with that density, uniform in angle and distance about the place: even draws would have no finite
+    variance. Else it is even.
+    """
     has_port, leave = port is not None, (port or FLAT_PORT).leave
 
     @wp.func

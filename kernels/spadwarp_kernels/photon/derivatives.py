@@ -115,12 +115,15 @@ def make_derivatives(
 
 
 def make_blocks(grid: Grid, shape: Sequence[int], scale: Sequence[float]) -> Blocks:
-    """The cells of a grid in blocks of equally many. Raises `ArgumentError`.
+    """The cells of a grid in blocks of equally many.
 
     Args:
         grid: From `make_grid`.
         shape: Number of blocks along the three edges; each divides the number of cells there.
         scale: Tally units of the derivative per emitted photon, by kind in `TransportSpec.blocks`.
+
+    Raises:
+        ArgumentError: A number that does not divide that of the cells, or is out of range; too many derivatives.
     """
     check.kind("grid", grid, Grid)
     shape, scale = check.items("shape", shape), check.items("scale", scale)

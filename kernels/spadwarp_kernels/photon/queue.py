@@ -166,9 +166,11 @@ ADD_ENTRY, READ_SIZE, SET_SIZE = (wp.constant(i) for i in range(3))
     return number;
 """)
 def queue_size(memory: int, act: int, number: int) -> int:
-    """The number of entries of the warp's queue; CUDA alone. ADD_ENTRY: any lane adds one and gets its index.
-    READ_SIZE: all lanes together read the size, after which they see what the entries hold. SET_SIZE: all lanes
-    together set it to a number."""
+    """The number of entries of the warp's queue; CUDA alone.
+
+    ADD_ENTRY: any lane adds one and gets its index. READ_SIZE: all lanes together read the size, after which they see
+    what the entries hold. SET_SIZE: all lanes together set it to a number.
+    """
     ...
 
 
@@ -197,8 +199,10 @@ def _size(spec: TransportSpec, flights: bool, long: bool) -> tuple[int, int]:
 
 def long_queue_fits(spec: TransportSpec, in_tree: bool) -> bool:
     """Whether a block's shared memory holds a `long` queue of flights and, `in_tree`, leaves the cache enough for the
-    walk down the tree. Not in grids: with 72 registers the longer queues of all warps would leave 28 kB of cache, in
-    place of 92 kB."""
+    walk down the tree.
+
+    Not in grids: with 72 registers the longer queues of all warps would leave 28 kB of cache, in place of 92 kB.
+    """
     entries, vectors = _size(spec, True, True)
     kib = _KIB_IN_TREE if in_tree else 48
     return spec.grid is None and 16 * (_QUEUE + vectors * entries) * BLOCK_SIZE // 32 <= kib * 1024

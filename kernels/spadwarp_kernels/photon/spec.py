@@ -55,7 +55,8 @@ class TransportSpec(NamedTuple):
     phase: PhaseFunction = HENYEY_GREENSTEIN  # phase function of the water
     random_albedo: bool = False  # draw the albedo uniformly from [0, medium.albedo] at each collision
     mesh: bool = True  # trace rays against a mesh
-    brute_force: bool = False  # on CUDA, try every face, of up to BRUTE_FORCE_FACES, rather than walk the tree
+    brute_force: bool = False
+    """On CUDA, try every face rather than walk the tree; for meshes of up to BRUTE_FORCE_FACES faces."""
     bounded: bool = False  # honour the domain and the lateral limit
     roulette: bool = False  # russian roulette instead of the weight cut-off
     records: bool = False  # write the terminal state of each photon
@@ -70,7 +71,8 @@ class TransportSpec(NamedTuple):
     rotated_domain: bool = False  # the domain has axes of its own
     reflecting: bool = False  # faces of the domain reflect, as `Limits.boundary` says; needs `bounded`
     use_warp_bvh: bool = False  # rays take `wp.mesh_query_ray`, see `make_surfaces`
-    stepped: bool = False  # photons are numbered from `data.offset[0]` on, so that a captured launch can draw new ones
+    stepped: bool = False
+    """Photons are numbered from `data.offset[0]` on, which is on the device: a captured launch can draw new ones."""
     merged: bool = False
     """The tally is [2, pixel, bin], of light that has met a surface, and of backscatter. The ledger's counts of what is
     below one unit do not tell components then."""
@@ -91,15 +93,18 @@ class TransportSpec(NamedTuple):
     blocks: tuple[str, ...] = ()
     """Kinds of the coefficients of a grid's cells by which it is differentiated block by block, each one of
     BLOCK_DERIVATIVES; the blocks are those of `Derivatives.blocks`."""
-    polarised: bool = False  # photons carry a Stokes vector, whose light is scored, see `Model.polarisation`
-    lines: bool = False  # photons carry light of other wavelengths, see `Model.lines`, one a channel; not in cells
+    polarised: bool = False
+    """Photons carry a Stokes vector, and scores are of the light that it stands for, see `Model.polarisation`."""
+    lines: bool = False
+    """Photons carry light of other wavelengths, see `Model.lines`, of which each of `channels` is one; not in cells."""
     points: int = 1
     """At how many points of a flight `guided` scores it, 1 to MOST_POINTS; more than one without `reflecting`, `blocks`
     and DELTA_TRACKING, three with up to 4 derivatives."""
     flux: tuple[str, ...] = ()
     """Kinds of the sections of `Model.flux`, each one of FLUX_KINDS; for estimators that neither guide light nor let
     it fly on after its last event, and without `polarised`."""
-    sun: bool = False  # the light is that of sun and sky, see `make_sun`, through the surface of a sea
+    sun: bool = False
+    """The light is that of sun and sky, see `make_sun`, through the surface of a sea."""
     channels: int = 0
     """What the receiver takes of polarised light beside its intensity, at most MOST_CHANNELS, or lines at other
     wavelengths, at most MOST_LINES, each with a tally of its own."""

@@ -108,8 +108,11 @@ class Account:
 
 @wp.struct
 class Weight:
-    """The weight of a photon, and its account. `absorbed_water` is what photons had, less what was left and what was
-    booked. It is what water took once the thread's other sums for the ledger are subtracted, at its end."""
+    """The weight of a photon, and its account.
+
+    `absorbed_water` is what photons had, less what was left and what was booked. It is what water took once the
+    thread's other sums for the ledger are subtracted, at its end.
+    """
 
     value: float  # fraction of the photon that is left
     taken: wp.int64  # by which the last change lowered it, in ledger units
@@ -251,8 +254,11 @@ def shorten(flight: wp.ref[Flight], distance: float):
 
 @wp.func
 def reweigh(w: wp.ref[Weight], factor: float):
-    """Multiplies the weight by a factor. The ledger is written where weight changes hands; water takes what is missing
-    there. What is taken is to be added to one of the thread's sums for the ledger, or to be booked by `book_weight`."""
+    """Multiplies the weight by a factor.
+
+    The ledger is written where weight changes hands; water takes what is missing there. What is taken is to be added to
+    one of the thread's sums for the ledger, or to be booked by `book_weight`.
+    """
     before = to_ledger(w.value)
     w.value *= factor
     w.taken = before - to_ledger(w.value)
@@ -298,8 +304,10 @@ def merged_index(camera: Camera, gate: Gate, pixel: int, path: float, component:
 
 @wp.func
 def to_fixed_point(units: float, rounding_sample: float) -> wp.int64:
-    """units >= 0, rounded up with probability equal to its fraction, for rounding_sample uniform in [0, 1). For samples
-    on the grid k / 2^24 the mean is kept to 2^-25 unit, or 2^-24 of the value where that is more."""
+    """units >= 0, rounded up with probability equal to its fraction, for rounding_sample uniform in [0, 1).
+
+    For samples on the grid k / 2^24 the mean is kept to 2^-25 unit, or 2^-24 of the value where that is more.
+    """
     return wp.int64(units + rounding_sample)
 
 

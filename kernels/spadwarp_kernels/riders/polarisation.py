@@ -22,9 +22,11 @@ from .rider import NOTHING, Rider
 
 @wp.struct
 class Elements:
-    """A scattering matrix at one angle, over its own m11 (Bohren & Huffman 1983, eq 4.77). I' = I + m12 Q, Q' = m12 I +
-    m22 Q, U' = m33 U + m34 V, V' = -m34 U + m44 V, with respect to the plane of scattering: before and after, e1 is the
-    direction in which the scattering angle grows."""
+    """A scattering matrix at one angle, over its own m11 (Bohren & Huffman 1983, eq 4.77).
+
+    I' = I + m12 Q, Q' = m12 I + m22 Q, U' = m33 U + m34 V, V' = -m34 U + m44 V, with respect to the plane of
+    scattering: before and after, e1 is the direction in which the scattering angle grows.
+    """
 
     m12: float
     m22: float

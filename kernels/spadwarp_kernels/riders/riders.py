@@ -52,10 +52,13 @@ def make_rider(spec: TransportSpec) -> Rider:
 
 def _make_lines_rider(spec: TransportSpec) -> Rider:
     """Light of other wavelengths on the same paths: of other lines of the laser, and what has become such light by one
-    inelastic scattering at any of the events so far. Photons fly and scatter as light of the laser does; what would
-    have been scattered inelastically at an event, in place of elastically, is carried on with the coefficients of its
-    own wavelength over those, and so is light of a line of the laser from the start. Thus no photon is spent on what
-    few of them do, and each brings light of all wavelengths."""
+    inelastic scattering at any of the events so far.
+
+    Photons fly and scatter as light of the laser does; what would have been scattered inelastically at an event, in
+    place of elastically, is carried on with the coefficients of its own wavelength over those, and so is light of a
+    line of the laser from the start. Thus no photon is spent on what few of them do, and each brings light of all
+    wavelengths.
+    """
     count = spec.channels
 
     @wp.func

@@ -339,9 +339,11 @@ def _nodes_kernel(
 
 def pack_bvh(mesh: wp.Mesh, extent: float, join: bool = True) -> tuple[wp.array, wp.array, wp.array, wp.array]:
     """A mesh's tree for `step_node` and `step_leaf`: nodes, vec4 [4 * nodes]; faces, vec4 [3 * slots]; the face in each
-    slot, int32 [slots], or ~face where others of its leaf are tried after it; the level of each node. Boxes are padded
-    for coordinates up to the extent [m]. `join`: two faces that make a parallelogram are tried as one, not where the
-    points will move, see `refit_bvh`."""
+    slot, int32 [slots], or ~face where others of its leaf are tried after it; the level of each node.
+
+    Boxes are padded for coordinates up to the extent [m]. `join`: two faces that make a parallelogram are tried as one,
+    not where the points will move, see `refit_bvh`.
+    """
     tree, device = read_tree(mesh, extent), mesh.device
     faces, size, closed = tree.faces, tree.stop - tree.start, tree.children[:, 0] < 0
     last = np.zeros(len(faces), bool)  # whether a slot is the last of its leaf

@@ -25,7 +25,8 @@ class Textures:
     """Images on faces; arrays of length 0 where there are none."""
 
     face: wp.array[int]  # texture of each face, -1 for none
-    coordinates: wp.array2d[wp.vec2]  # (u, v) of each face's corners, [faces, 3]; u right, v up, period 1
+    coordinates: wp.array2d[wp.vec2]
+    """(u, v) of the corners of each face, [faces, 3]; u to the right, v up, images repeat with period 1."""
     region: wp.array[wp.vec3i]  # (offset into `texels`, width, height) of each texture
     texels: wp.array[float]  # reflectance factors in [0, 1], row after row from the top
 
@@ -42,11 +43,13 @@ class Surfaces:
     order: wp.array[int]  # likewise
     reflectance: wp.array[float]  # of each face, in [0, 1]
     near_depth: wp.array2d[float]  # what the camera cannot miss, see `near_depth_map`; empty if nothing is known
-    corner_reflectance: wp.array[wp.vec3]  # at each face's corners, in place of `reflectance`; empty unless it varies
+    corner_reflectance: wp.array[wp.vec3]
+    """At the three corners of each face, instead of `reflectance`; empty unless it varies."""
     textures: Textures  # images that multiply the corners' reflectance
     specular: wp.array[float]  # reflectance of the facets of the specular lobe, of each face; empty if there is none
     roughness: wp.array[float]  # their width parameter, see `microfacet`
-    depth: wp.array[int]  # of the nodes of a moving mesh's tree on CUDA; else empty
+    depth: wp.array[int]
+    """Of the nodes of a moving mesh's tree on CUDA; else empty."""
     levels: int  # their number; 1 for a moving mesh on the CPU
     extent: float  # largest coordinate that the tree is made for [m]
     patches: wp.array[wp.vec4]  # of a mesh of up to BRUTE_FORCE_FACES faces on CUDA, for rays that try them all
@@ -255,7 +258,7 @@ def no_textures(device: wp.DeviceLike = None) -> Textures:
 def make_textures(
     face: np.ndarray, coordinates: np.ndarray, images: Sequence[np.ndarray], *, device: wp.DeviceLike = None
 ) -> Textures:
-    """Images for the faces of a mesh. Raises `ArgumentError`.
+    """Images for the faces of a mesh.
 
     Args:
         face: Index into `images` for each face, -1 for none; integers [faces].
@@ -263,6 +266,9 @@ def make_textures(
             its upper right one; outside of [0, 1] it repeats.
         images: Reflectance factors in [0, 1], each [rows, columns], the first row on top.
         device: Where to.
+
+    Raises:
+        ArgumentError: Another shape, or a value out of range.
     """
     check.kind("images", images, Sequence)
     device = check.device("device", device)

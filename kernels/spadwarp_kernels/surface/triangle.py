@@ -183,13 +183,16 @@ def pack_faces(mesh: wp.Mesh, extent: float, order: wp.array) -> wp.array:
 
 @wp.func
 def meet_planes(a: wp.vec4, b: wp.vec4, n: wp.vec4, x: wp.vec3, u: wp.vec3) -> wp.vec2:
-    """A ray from x along the unit vector u against a triangle or a parallelogram, two triangles side by side. Two
-    coordinates in its plane are normals and offsets, -1 to 1 from edge to edge and 0 in the middle of the
+    """A ray from x along the unit vector u against a triangle or a parallelogram, two triangles side by side.
+
+    Two coordinates in its plane are normals and offsets, -1 to 1 from edge to edge and 0 in the middle of the
     parallelogram; the sum of a triangle's is not above 0. The normal of the plane is half as long as the least height;
-    the sign of its offset, also of a zero, is negative for a parallelogram. Returns the distance, >= 0, or -1 for a
-    miss, and the sum of the coordinates there, which is above 0 in the second triangle. A ray may pass a hair outside,
-    measured across the ray, so that none slips between two faces; more than that beyond the short edges of a sliver,
-    where its box ends it."""
+    the sign of its offset, also of a zero, is negative for a parallelogram.
+
+    Returns the distance, >= 0, or -1 for a miss, and the sum of the coordinates there, which is above 0 in the second
+    triangle. A ray may pass a hair outside, measured across the ray, so that none slips between two faces; more than
+    that beyond the short edges of a sliver, where its box ends it.
+    """
     rate = n[0] * u[0] + n[1] * u[1] + n[2] * u[2]
     height = n[3] - (n[0] * x[0] + n[1] * x[1] + n[2] * x[2])
     distance = height / rate  # infinite or not a number for a ray in the plane, which fails below

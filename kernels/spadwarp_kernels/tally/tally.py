@@ -242,9 +242,13 @@ def close_batch_kernel(
     overflow: wp.array[int],
 ):
     """Adds a batch to the total, to `half` if that is as long, and the square of its sum over components, times
-    `weight`, to a 128-bit sum, and empties it. `sums` takes its components, over voxels; `overflow` is set where a
-    total leaves [least, 2^62). Integers, so that the sums depend neither on the order of the batches nor on how they
-    were merged. Launch: runs of `run` voxels from the `first` on."""
+    `weight`, to a 128-bit sum, and empties it.
+
+    `sums` takes its components, over voxels; `overflow` is set where a total leaves [least, 2^62).
+
+    Integers, so that the sums depend neither on the order of the batches nor on how they were merged.
+    Launch: runs of `run` voxels from the `first` on.
+    """
     voxels = squares_low.shape[0]
     begin = (first + wp.tid()) * run
     end = wp.min(begin + run, voxels)
@@ -354,7 +358,9 @@ class Batches:
 
     def add(self, other: "Batches") -> None:
         """Adds the batches of another tally of the same components, which may be on another device and must rest.
-        Raises `ArgumentError` for another size or number of components."""
+
+        Raises `ArgumentError` for another size or number of components.
+        """
         check.kind("other", other, Batches)
         if other.second_moment[0].size != self.second_moment[0].size:
             raise ArgumentError(f"other has {other.second_moment[0].size} voxels, not {self.second_moment[0].size}")
@@ -414,7 +420,7 @@ def tally_rates(
     parameters: int = 1,
     parameter: int = 0,
 ) -> wp.array:
-    """Tallies added up over components, float32 `[pixel, bin]` on their device. Raises `ArgumentError`.
+    """Tallies added up over components, float32 `[pixel, bin]` on their device.
 
     Args:
         tally: int64, `Data.tally`, or `Data.gradients` with so many `parameters`.
@@ -423,6 +429,9 @@ def tally_rates(
         components: How many of `tally_components`, from the first on; by default all.
         parameters: Derivatives side by side in a voxel.
         parameter: Which of them.
+
+    Raises:
+        ArgumentError: Arrays or numbers that do not fit each other.
     """
     check.array("scale", scale, wp.float64, (None,), tally.device if isinstance(tally, wp.array) else None)
     bins, parameters = check.integer("bins", bins, 1), check.integer("parameters", parameters, 1)

@@ -54,9 +54,12 @@ class Stages(NamedTuple):
 
 @memoised
 def compose(spec: TransportSpec, cuda: bool) -> Stages:
-    """The stages of a spec. A thread moves its photons alone on a CPU, with Warp's own rays, and where blocks of cells
-    keep what they score with the thread. A handful of faces is tried on the spot; but a core walks the tree of a box in
-    a third of the time that its twelve faces take."""
+    """The stages of a spec.
+
+    A thread moves its photons alone on a CPU, with Warp's own rays, and where blocks of cells keep what they score with
+    the thread. A handful of faces is tried on the spot; but a core walks the tree of a box in a third of the time that
+    its twelve faces take.
+    """
     estimator = make_estimator(spec)
     alone = not cuda or bool(spec.blocks) or (spec.mesh and spec.use_warp_bvh)
     in_tree, flies_on = spec.mesh and not spec.faces.tried, estimator.cross is not None

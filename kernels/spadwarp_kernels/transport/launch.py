@@ -58,7 +58,11 @@ _STRUCTS = {name: var.type for name, var in World.vars.items() if name not in ("
 
 @dataclass(frozen=True)
 class Model:
-    """What is transported through: immutable, on one device. Raises `ArgumentError`."""
+    """What is transported through: immutable, on one device.
+
+    Raises:
+        ArgumentError: Another kind of struct, a device that does not exist, or a scale that is not positive.
+    """
 
     device: wp.Device  # Warp device that holds the arrays
     medium: Medium  # parameter structs
@@ -72,9 +76,12 @@ class Model:
     scale: float  # tally units per emitted photon
     layers: Layers = field(default_factory=Layers)  # of a layered spec, from `make_layers`; empty otherwise
     scan: Scan = field(default_factory=Scan)  # raster of a confocal spec; empty otherwise
-    derivatives: Derivatives = field(default_factory=Derivatives)  # of a spec with derivatives or channels
-    polarisation: Polarisation = field(default_factory=Polarisation)  # of a polarised one, by `make_polarisation`
-    lines: Lines = field(default_factory=Lines)  # of one with `lines`, from `make_lines`
+    derivatives: Derivatives = field(default_factory=Derivatives)
+    """The parameters of a spec with derivatives or channels, from `make_derivatives`."""
+    polarisation: Polarisation = field(default_factory=Polarisation)
+    """Those of a polarised spec, from `make_polarisation`."""
+    lines: Lines = field(default_factory=Lines)
+    """Of a spec with `lines`, from `make_lines`."""
     flux: Flux = field(default_factory=Flux)  # sections of a spec with flux, from `make_flux`
     sea: Sea = field(default_factory=Sea)  # the surface of a sea, from `make_sea`; of index 0 without one
     split_accumulators: bool = False
@@ -111,8 +118,11 @@ class Data:
     tally: wp.array  # int64 [component * height * width * bin], fixed point
     ledger: wp.array  # int64 [LEDGER_WIDTH * LEDGER_SLOTS]; the sum over slots is the ledger, see `read_ledger`
     records: Records  # terminal states of the last launch's photons
-    cursor: wp.array  # int32 [1]: how many photons warps have taken; launches that share it go to one stream
-    offset: wp.array | None = None  # uint64 [1], added to the ids where `spec.stepped` is set; the caller moves it on
+    cursor: wp.array
+    """int32 [1]: how many photons of the running launch have been handed out; launches that share it go to one
+    stream."""
+    offset: wp.array | None = None
+    """uint64 [1], added to the photons' ids where `spec.stepped` is set; the caller moves it on."""
     reflecting: bool = False  # whether faces of the domain reflect, so that `read_ledger` reports on them
     has_sea: bool = False  # whether there is a surface of a sea, likewise
     gradients: wp.array | None = None

@@ -24,9 +24,11 @@ __all__ = ["make_transport_kernel"]
 @memoised
 def make_transport_kernel(spec: TransportSpec, cuda: bool = False) -> wp.Kernel:
     """The transport kernel for a spec; launch grid: any number of threads, which share the photons among them.
-    Raises `ArgumentError`.
 
     On CUDA they must be a multiple of the block size, since whole warps vote.
+
+    Raises:
+        ArgumentError: An estimator that is not one of ESTIMATORS, or confocal with the plain lens.
     """
     check_spec(spec)
     if not cuda and spec != spec.on_cpu:

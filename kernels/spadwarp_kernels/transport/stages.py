@@ -166,9 +166,12 @@ def make_meet(choose: wp.Function | None) -> wp.Function:
 def make_fly(
     spec: TransportSpec, plan_flight: wp.Function | None, meet: wp.Function, random_albedo: bool, cuda: bool
 ) -> wp.Function:
-    """The Warp function ``(s, world, words)``: lets a photon fly, to EVENT or, where a tree of faces may be in its way,
-    to RAY. On a CPU `words`, PREFETCHED_WORDS of them, keep the random words of the photon's next flights. They are
-    drawn for several flights at once, so that it must be called for each flight of a photon in turn."""
+    """The Warp function ``(s, world, words)``: lets a photon fly, to EVENT or, where a tree of faces may be
+    in its way, to RAY.
+
+    On a CPU `words`, PREFETCHED_WORDS of them, keep the random words of the photon's next flights. They are drawn for
+    several flights at once, so that it must be called for each flight of a photon in turn.
+    """
     plans, tried, surface = plan_flight is not None, spec.faces.tried, spec.sight.sea or FACETS
     events, prefetch = philox.make_prefetch(philox.STREAM_TRANSPORT, *([philox.STREAM_FLIGHT_SAMPLE] if plans else []))
     last = events - 1
@@ -254,8 +257,10 @@ class Collision:
 
 def make_collide(spec: TransportSpec, chosen: bool, flies_on: bool, score_flux: wp.Function | None) -> wp.Function:
     """The Warp function ``(s, world, sink)``: takes a photon to the end of its flight, and on to SCATTER or to END.
+
     `chosen`: an estimator chooses what ends a flight; `flies_on`: see `continues`; `score_flux`: see
-    `make_flux_score`."""
+    `make_flux_score`.
+    """
     domain, rider, sea = spec.domain, make_rider(spec), spec.sight.sea is not None
     reflects, bounded = domain.reflects, domain.bounded and not domain.reflects
     tallies_flux = score_flux is not None
@@ -370,8 +375,10 @@ class Outcome:
 
 
 def make_sample_direction(spec: TransportSpec, direct: wp.Function | None) -> wp.Function:
-    """The Warp function ``(s, reflected, lobe, world, id) -> Direction``. Directions follow the phase function and the
-    surface's law, unless an estimator has a way of its own."""
+    """The Warp function ``(s, reflected, lobe, world, id) -> Direction``.
+
+    Directions follow the phase function and the surface's law, unless an estimator has a way of its own.
+    """
     if direct is not None:
         return direct
     water = spec.water
@@ -424,8 +431,10 @@ def make_terminate(spec: TransportSpec) -> wp.Function:
 
 def make_lose(spec: TransportSpec, directed: bool, flies_on: bool) -> wp.Function:
     """The Warp function ``(s, world, sink, id, part, entry) -> bool``: a boundary sends on a part of the photon, and an
-    entry of the ledger takes the rest; whether there is a flight. `directed`: weight and analog weight differ;
-    `flies_on`: see `continues`."""
+    entry of the ledger takes the rest; whether there is a flight.
+
+    `directed`: weight and analog weight differ; `flies_on`: see `continues`.
+    """
     terminate = make_terminate(spec)
 
     @wp.func
@@ -492,8 +501,10 @@ def make_meet_sea(spec: TransportSpec, lose: wp.Function) -> wp.Function:
 
 
 def make_scatter(spec: TransportSpec, direct: wp.Function | None, flies_on: bool) -> wp.Function:
-    """The Warp function ``(s, world, sink)``: takes a photon from its event to FLIGHT, or to END. `flies_on`: see
-    `continues`."""
+    """The Warp function ``(s, world, sink)``: takes a photon from its event to FLIGHT, or to END.
+
+    `flies_on`: see `continues`.
+    """
     directed, sea, rider = direct is not None, spec.sight.sea is not None, make_rider(spec)
     sample_direction, terminate = make_sample_direction(spec, direct), make_terminate(spec)
     lose = make_lose(spec, directed, flies_on)

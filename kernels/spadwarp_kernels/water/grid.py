@@ -359,10 +359,10 @@ def make_grid(
     shares: ArrayLike = (),
     device: wp.DeviceLike = None,
 ) -> Grid:
-    """Cells for `Layers.grid` of a spec with a grid. Raises `ArgumentError`.
+    """Cells for `Layers.grid` of a spec with a grid.
 
     Args:
-        extinction: c [1/m] >= 0, `[x, y, z]`, along the box's own axes; up to 2^30 cells.
+        extinction: c [1/m] >= 0, `[x, y, z]`, along the box's own axes.
         albedo: In [0, 1], of the same shape.
         anisotropy: g in (-1, 1), of the same shape; None: the medium's.
         size: Edges of the box [m].
@@ -371,6 +371,9 @@ def make_grid(
         block_edge: Cells along the edges of the blocks that delta tracking flies through; None: 6 blocks along the
             longest edge, the fastest for 128^3 cells on an H200.
         shares: Of mixtures, `[x, y, z, constituent]`, see `mixture_shares`.
+
+    Raises:
+        ArgumentError: Another shape, a number out of range, or more than 2^30 cells.
     """
     device = check.device("device", device)
     arrays = {"extinction": check.numbers("extinction", extinction, (None,) * 3, "[0, inf)").astype(np.float32)}

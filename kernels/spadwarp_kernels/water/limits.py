@@ -127,13 +127,16 @@ def image_reflectance(boundary: Boundary, image: wp.vec3i, u: wp.vec3) -> float:
 def make_boundary(
     low: Sequence[float], high: Sequence[float], *, max_reflections: int = 2, device: wp.DeviceLike = None
 ) -> Boundary:
-    """Faces that reflect, of a `reflecting` spec. Raises `ArgumentError`.
+    """Faces that reflect, of a `reflecting` spec.
 
     Args:
         low, high: Phase index outside the lower and the upper faces across x, y and z, over that of the water; 0 for a
             face that lets all light out, a very large number for a mirror.
         max_reflections: On the way from a scattering to the lens, 0 ... 8; more are left out. `analog` counts what it
             drops for this.
+
+    Raises:
+        ArgumentError: A number out of range, or all faces let light out.
     """
     sides = [check.numbers(name, one, (3,), "[0, 1e9]").tolist() for name, one in (("low", low), ("high", high))]
     most = check.integer("max_reflections", max_reflections, 0, 8)

@@ -42,7 +42,10 @@ class Medium:
 
 def make_medium(absorption: float, scattering: float, *, anisotropy: float = 0.0) -> Medium:
     """Water from its coefficients [1/m], 0 or more, with the mean cosine g of its phase function in (-1, 1).
-    Raises `ArgumentError`."""
+
+    Raises:
+        ArgumentError: A number out of range.
+    """
     scattering = check.number("scattering", scattering, "[0, inf)")
     extinction = check.number("absorption", absorption, "[0, inf)") + scattering
     g = check.number("anisotropy", anisotropy, "(-1, 1)")
@@ -96,7 +99,6 @@ def make_lines(
     device: wp.DeviceLike = None,
 ) -> Lines:
     """Up to MOST_LINES lines, with the phase function of the medium for what is scattered later.
-    Raises `ArgumentError`.
 
     Args:
         source: Coefficients of the inelastic scattering [1/m], >= 0, `[water, line]`; the water's absorption has it. Of
@@ -108,6 +110,9 @@ def make_lines(
         media: The medium, or the waters of the layers, at the laser's wavelength; the scattering is above 0.
         elastic: The lines are of the laser, and light of a line is there from the start.
         delay: Group index at the line over that of the medium, by default 1.
+
+    Raises:
+        ArgumentError: A number out of range, or lists of several lengths.
     """
     device, lines, waters = check.device("device", device), Lines(), len(check.items("media", media))
     count = check.integer("number of lines", len(check.items("passed", passed)), 1, MOST_LINES)
@@ -148,7 +153,8 @@ class Grid:
     size: wp.vec3i  # number of cells along the three edges
     extinction: wp.array[float]  # c [1/m] by cell, the last edge fastest
     albedo: wp.array[float]  # single-scattering albedo in [0, 1]
-    anisotropy: wp.array[float]  # g in (-1, 1), if the phase function uses the medium's; empty: that everywhere
+    anisotropy: wp.array[float]
+    """g in (-1, 1), for phase functions that use the medium's; empty: the medium's everywhere."""
     block_edge: int  # cells along the edges of a block
     block_size: wp.vec3i  # number of blocks along the three edges of the box; the last may be incomplete
     block_majorant: wp.array[float]  # largest c in each block [1/m]
@@ -166,7 +172,8 @@ class Layers:
     """
 
     axis: wp.vec3  # unit vector
-    start: wp.array[float]  # position x·axis at which each layer begins [m], ascending; the first is not read
+    start: wp.array[float]
+    """Position along the axis, x·axis, at which each layer begins [m], ascending; the first is not read."""
     extinction: wp.array[float]  # c [1/m], > 0
     albedo: wp.array[float]  # single-scattering albedo in [0, 1]
     anisotropy: wp.array[float]  # g in (-1, 1), for phase functions that use the medium's

@@ -74,7 +74,6 @@ def fournier_forand_density(t: ArrayLike, particle_index: float, junge_slope: fl
 
 def interpolated_density(angles: ArrayLike, values: ArrayLike) -> Callable[[ArrayLike], Floats]:
     """A measured phase function, normalised: power laws in theta between the points, linear next to a zero.
-    Raises `ArgumentError`.
 
     Below the first angle the first power law goes on if it falls with theta (no steeper than theta^-1.9, whose integral
     is finite), else the first value; beyond the last angle the last value.
@@ -82,6 +81,9 @@ def interpolated_density(angles: ArrayLike, values: ArrayLike) -> Callable[[Arra
     Args:
         angles: Scattering angles [rad], ascending in [0, pi], two or more.
         values: >= 0, of any scale.
+
+    Raises:
+        ArgumentError: Angles or values are not of that kind.
     """
     theta = check.numbers("angles", angles, (None,), f"[0, {np.pi}]")
     value = check.numbers("values", values, theta.shape, "[0, inf)")
@@ -149,10 +151,12 @@ class PhaseGuide(NamedTuple):
     from the lens. The lobe is about the very point of the lens at which that flight is scored.
     """
 
-    complement: wp.Function  # ``(theta: float, medium: Medium) -> float``, integral of q from theta to pi
+    complement: wp.Function
+    """``(theta: float, medium: Medium) -> float``, integral of q from theta to pi; falls with theta."""
     angle: wp.Function  # ``(value: float, medium: Medium) -> float``, the inverse of it
     density: wp.Function  # ``(theta: float, medium: Medium) -> float``, q itself
-    lobe_pdf: wp.Function  # ``(t, medium, guiding: Guiding) -> float``, t = 1 - cos of the angle to the lens
+    lobe_pdf: wp.Function
+    """``(t: float, medium: Medium, guiding: Guiding) -> float``, t = 1 - cos of the angle to the lens."""
     lobe_sample: wp.Function  # ``(xi: float, medium: Medium, guiding: Guiding) -> float``, returns t
     chord: bool = False
     """The functions take, and q is over, the chord c = 2 sin(theta/2) in (0, 2) instead of theta, which needs no
@@ -168,8 +172,10 @@ class PhaseFunction(NamedTuple):
     guide: PhaseGuide | None = None
     """How the estimator `guided` follows it; None: as it follows Henyey-Greenstein with the medium's anisotropy. No
     guide makes it wrong, a poor one makes it noisy."""
-    constituents: int = 0  # of a mixture, from `make_mixture`: how many phase functions it has, by their shares
-    part: wp.Function | None = None  # of one ``(t, medium, constituent: int) -> float``: the density of that over `pdf`
+    constituents: int = 0
+    """Of a mixture, from `make_mixture`: how many phase functions it has, weighted by the shares at the point."""
+    part: wp.Function | None = None
+    """Of a mixture ``(t: float, medium: Medium, constituent: int) -> float``: the density of one of them over `pdf`."""
 
 
 # ---- The phase function of Henyey and Greenstein.
@@ -398,12 +404,14 @@ def make_phase_tables(
     device: wp.DeviceLike = None,
 ) -> DensityTables:
     """The tables of a phase function, for `Medium.phase` with the phase function TABULATED, or a mixture.
-    Raises `ArgumentError`.
 
     Args:
         density: Over t = 1 - cos(theta) in (0, 2), >= 0, of any scale. Towards t = 0 it may rise as t^-0.95.
         constituents: Of a mixture the phase functions of each, of which `density` is the sum that `guided` follows. The
             one with the sharpest forward peak comes first: its smallest angles are drawn with the most digits.
+
+    Raises:
+        ArgumentError: A density is negative, not finite or zero everywhere.
     """
     device = check.device("device", device)
     check.kind("density", density, Callable)
