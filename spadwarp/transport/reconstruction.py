@@ -239,12 +239,13 @@ def _first_bin(scene: Scene, mesh: TriangleMesh | None) -> int:
         return gate.bins
     light = lines_of_sight(scene)
     ways = light, replace(light, laser=np.zeros(3), laser_port=camera_port(scene))
-    radii = beam.beam_radius * (beam.profile == "collimated") + camera.aperture_radius * (not camera.pinhole)
+    begin = beam.beam_radius if beam.profile == "collimated" else 0.0
+    lens = 0.0 if camera.pinhole else camera.aperture_radius
     corners, enough = mesh.vertices.astype(np.float64)[mesh.faces], 0.1 * scene.medium.pulse_speed * gate.bin_width
     while True:
         middle = corners.mean(axis=1)
         reach = np.linalg.norm(corners - middle[:, None], axis=-1).max(axis=1)
-        path = np.zeros(len(middle))
+        path = -lens * np.linalg.norm(middle[:, :2], axis=-1) / np.linalg.norm(middle, axis=-1) - begin
         for way in ways:  # behind a port as in its air, whose index is about 1
             straight = np.linalg.norm(middle - way.laser, axis=-1) / scene.medium.group_index
             path += np.fmax(way.light_at(middle)[2], straight)
@@ -255,7 +256,7 @@ def _first_bin(scene: Scene, mesh: TriangleMesh | None) -> int:
         a, b, c = corners[near].swapaxes(0, 1)
         ab, bc, ca = 0.5 * (a + b), 0.5 * (b + c), 0.5 * (c + a)
         corners = np.stack([a, ab, ca, ab, b, bc, ca, bc, c, ab, bc, ca], axis=1).reshape(-1, 3, 3)
-    first = ((shortest - radii) / scene.medium.pulse_speed - gate.start) / gate.bin_width
+    first = (shortest / scene.medium.pulse_speed - gate.start) / gate.bin_width
     return int(np.clip(math.floor(first), 0, gate.bins))
 
 
@@ -296,16 +297,6 @@ class _Rows:
         return np.take_along_axis(values, index, axis=-1)
 
 
-def _blurred(light: Cube, radius: int | None) -> Cube:
-    """Light by two boxes of this radius, or its mean over the image."""
-    from scipy.ndimage import uniform_filter
-
-    if radius is None:
-        return np.broadcast_to(light.mean(axis=(0, 1)), light.shape)
-    box: Any = {"size": (2 * radius + 1, 2 * radius + 1, 1), "mode": "constant"}
-    return uniform_filter(uniform_filter(light, **box), **box)
-
-
 def _forward(known: KnownLight, ballistic: Cube, rows: _Rows, bins: _Rows, light: Cube) -> Cube:
     """Prediction of forward-scattered light from its tallies."""
     from scipy.ndimage import uniform_filter
@@ -316,15 +307,14 @@ def _forward(known: KnownLight, ballistic: Cube, rows: _Rows, bins: _Rows, light
         (fine, known.span, delay, _FINE) for fine in (known.direct, known.scattered) for delay in _DELAYS
     ]
     even = bins.delayed(known.even, known.span, (0, 1), _FINE).numpy().reshape(bins.shape)
-    lit = np.flatnonzero(even.any(axis=(0, 1)))
-    first, last = (int(lit[0]), int(lit[-1]) + 1) if len(lit) else (0, 0)
-    span = wp.full(len(known.span), wp.vec2i(first, last), dtype=wp.vec2i, device=device)
     for sharp, radii in ((ballistic, _BLURS[1:]), (even, _BLURS)):
         for radius in radii:
-            blurred = np.zeros_like(sharp)
-            blurred[..., first:last] = _blurred(sharp[..., first:last], radius)
+            size = (1, 1, 1) if radius is None else (2 * radius + 1, 2 * radius + 1, 1)
+            blurred = uniform_filter(uniform_filter(sharp, size, mode="constant"), size, mode="constant")
+            if radius is None:
+                blurred[:] = blurred.mean(axis=(0, 1))
             pixels: Any = wp.array(blurred.reshape(flat), dtype=float, device=device)
-            terms += [(pixels, span, delay, 1) for delay in _BLURRED_DELAYS]
+            terms += [(pixels, bins.every, delay, 1) for delay in _BLURRED_DELAYS]
     columns = np.stack([rows.delayed(*term).numpy().ravel() for term in terms])
     columns /= (sums := np.maximum(columns.sum(axis=1), 1e-30))[:, None]
     light = rows.summed(light)

@@ -126,7 +126,7 @@ LINES = {
     "parallel": (600, 566),
     "result": (1500, 2113),
     "scene": (3700, 5204),
-    "transport": (2300, 3478),
+    "transport": (2300, 3468),
     "validate": (750, 794),
     "viz": (2200, 2548),
     "water": (800, 848),
