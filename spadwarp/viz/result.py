@@ -228,9 +228,8 @@ def _result_figure(
         panels.unclear = None
         panels.show_intensity(ballistic * per_pulse, "Ballistic light alone", "expected detections per pulse")
         for channel in shown_channels:
-            part = analyser_channel(result, channel).intensity * per_pulse
-            name = style.CHANNEL_NAMES[channel].capitalize()
-            panels.show_intensity(part, f"{name} light", "expected detections per pulse")
+            part, name = analyser_channel(result, channel).intensity * per_pulse, style.CHANNEL_NAMES[channel]
+            panels.show_intensity(part, f"{name.capitalize()} light", "expected detections per pulse")
         if shown_channels:
             panels.unclear = unclear
             part = degree_of_polarisation(result, gated=True)

@@ -380,9 +380,10 @@ def video(
 
 def _light(run: Held, frame: int) -> tuple[NDArray[np.float64], NDArray[np.float64], str, float]:
     """Histograms `[H, W, T]`, edges [ns], what they count, metres of path per ns."""
-    if isinstance(run, Result):
-        return run.detections, 1e9 * run.bin_edges, "detections per pulse, pixel", 1e-9 * run.pulse_speed
     cube: NDArray[Any]
+    if isinstance(run, Result):
+        cube = run.expected() * (run.scene.laser.photons_per_pulse * run.scene.detections_per_photon)
+        return cube, 1e9 * run.bin_edges, "detections per pulse, pixel", 1e-9 * run.pulse_speed
     scene: Any
     if isinstance(run, FramesFile):
         cube, edges, scene, what = run.counts(frame), run.gate_start + run.edges, run.scene, "counts"
