@@ -81,7 +81,7 @@ class KnownLight(NamedTuple):
 def reconstruct(result: Result, *, device: str | None = None) -> Result:
     """The result with `Result.reconstruction`: its light without most of its noise; tallies stay as they are.
 
-    Of the histogram by component; derivatives and polarised channels are left as they are. Takes about 300 bytes a bin.
+    Of the histogram by component; derivatives and polarised channels are left as they are. Takes about 400 bytes a bin.
 
     Args:
         result: With two halves, `Result.halves`, and a scene whose files are still there.
