@@ -42,6 +42,7 @@ from spadwarp.values import (
     SEED,
     ArgumentError,
     ConfigError,
+    Shown,
     check_choice,
     check_integer,
     range_from_time,
@@ -129,10 +130,7 @@ class Proposal:
         error, pulses = 1e3 * self.terms["total"], self.pulses
         return f"Proposal({error:.3g} mm with {pulses} pulses, {self.frame_time:.3g} s; limit: {self.limit})"
 
-    def _repr_html_(self) -> str:
-        import spadwarp
-
-        return spadwarp.viz.html(self)
+    _repr_html_ = Shown._repr_html_
 
     @property
     def values(self) -> dict[str, float | int]:

@@ -38,6 +38,7 @@ from spadwarp.values import (
     SEED,
     TIME,
     ArgumentError,
+    Shown,
     SpadwarpWarning,
     check_integer,
     check_real,
@@ -339,10 +340,7 @@ class Frames:
 
         return spadwarp.viz.plot(self, frame=frame, **options)
 
-    def _repr_html_(self) -> str:
-        import spadwarp
-
-        return spadwarp.viz.html(self)
+    _repr_html_ = Shown._repr_html_
 
     def to_xarray(self) -> Any:
         """Counts and what they were drawn from, with coordinates and units: see `spadwarp.frames.to_xarray`."""
