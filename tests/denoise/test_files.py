@@ -161,8 +161,8 @@ def test_dim_pixels_of_expected_light_are_noted(tmp_path):
 
 def test_histograms_of_a_dataset_are_not_used_and_it_is_said_why(tmp_path):
     few = {"targets.builtin": ["staircase"], "targets.test": [], "targets.validation": [], "gate.bins": 32}
-    traced = {"scenes_per_target": 1, "monte_carlo.share": 1.0, "monte_carlo.photons": 5_000}
-    make(recipe(**few, **traced), tmp_path / "set")
+    few |= {"scene.camera.width": 12, "scene.camera.height": 8, "scenes_per_target": 1, "frames.per_scene": 2}
+    make(recipe(**few, **{"monte_carlo.share": 1.0, "monte_carlo.photons": 5_000}), tmp_path / "set")
     stored = [item["noisy"][0] for item in FrameReader(tmp_path / "set", "all")]
     for name in ("histograms-00000.h5", "frames-00000.h5"):
         found = denoise_file(tmp_path / "set" / name, tmp_path / "out", model="median", device="cpu")
