@@ -390,10 +390,10 @@ class Panels:
         if not np.isfinite(image).any():
             bar.set_visible(False)
             middle_text(axis, "no values")
-        if scale == "log":
+        elif scale == "log":
             log_ticks(bar.xaxis, self._line / 0.4)
         else:
-            digits = len(f"{abs(high):.0f}") + max(1, math.ceil(-math.log10(high - low)) + 2)
+            digits = len(f"{abs(high):.0f}") + max(1, math.ceil(-math.log10(high - low or 1.0)) + 2)
             colour_bar.locator = MaxNLocator(nbins=max(1, min(6, int(self._line / max(0.45, 0.08 * digits)))))
             colour_bar.formatter = ScalarFormatter(useOffset=False)
             bar.xaxis.minorticks_on()

@@ -163,11 +163,9 @@ def test_findings_have_their_numbers(field):
 def test_each_line_is_checked_in_its_own_water():
     lines = {"laser__wavelengths_nm": [480.0, 532.0, 600.0], "medium__group_index": 1.34}
     assert find(checked(**lines), "laser.wavelengths_nm").text.startswith("all lines have the same water")
-    coastal = {
-        "medium": {"preset": "uwoc-coastal", "group_index": 1.36},
-        "laser": {"wavelengths_nm": [480.0, 532.0, 600.0]},
-    }
-    messages = check(Scene.from_dict({**BASE.to_dict(), **coastal}), plate(5.0))
+    coastal = {"preset": "uwoc-coastal", "group_index": 1.36}
+    several = {"medium": coastal, "laser": {"wavelengths_nm": [480.0, 532.0, 600.0]}}
+    messages = check(Scene.from_dict({**BASE.to_dict(), **several}), plate(5.0))
     assert find(messages, "medium.preset").text.startswith("at 480, 600 nm: ")
 
 

@@ -57,16 +57,13 @@ def test_ambient_light_may_follow_the_reflectance():
     counts = counts_of(np.where(np.arange(SIZE[1]) % 20 < 10, 14.5, 15.0) + np.zeros(SIZE), level, 3.0, scale=scale)
     found = estimate_background(counts, TAPS)
     assert not found.decays and found.per_bin.sum() == pytest.approx(60.0, rel=0.03)
-    assert np.abs(found.scale - scale).mean() < 0.06 and np.allclose(
-        found.counts, found.scale[..., None] * found.per_bin
-    )
+    assert np.abs(found.scale - scale).mean() < 0.06
+    assert np.allclose(found.counts, found.scale[..., None] * found.per_bin)
 
 
 def test_the_standard_error_is_that_of_many_frames():
-    level = np.full(BINS, 0.05)
-    found = [
-        estimate_background(counts_of(np.full((24, 24), np.nan), level, 0.0, seed=seed), TAPS) for seed in range(40)
-    ]
+    level, clean = np.full(BINS, 0.05), np.full((24, 24), np.nan)
+    found = [estimate_background(counts_of(clean, level, 0.0, seed=seed), TAPS) for seed in range(40)]
     z = [(one.per_bin.sum() / level.sum() - 1.0) / one.relative_error for one in found]
     assert 0.6 < np.std(z) < 1.4 and abs(np.mean(z)) < 0.6
     assert sum(one.decays for one in found) <= 2
@@ -112,17 +109,16 @@ def test_depth_is_as_good_as_with_the_true_background(tmp_path):
 def test_a_file_may_have_its_background_given(tmp_path):
     counts = counts_of(np.full((16, 16), 14.6), np.full(BINS, 0.05), 5.0)
     np.save(tmp_path / "counts.npy", counts)
-    options = {"bin_width": 130e-12, "gate_start": 0.0, "irf": InstrumentResponse(sigma=170e-12)}
-    read = read_depth(tmp_path / "counts.npy", background=np.full(BINS, 0.05), group_index=1.0, **options)
+    facts = {"bin_width": 130e-12, "gate_start": 0.0, "group_index": 1.0}
+    options = facts | {"irf": InstrumentResponse(sigma=170e-12)}
+    read = read_depth(tmp_path / "counts.npy", background=np.full(BINS, 0.05), **options)
     assert read.histograms.level_known and np.allclose(read.histograms.background, 0.05)
-    assert not read_depth(
-        tmp_path / "counts.npy", background="none", group_index=1.0, **options
-    ).histograms.background.any()
+    assert not read_depth(tmp_path / "counts.npy", background="none", **options).histograms.background.any()
     with pytest.raises(ArgumentError, match=r"background has shape \(5,\)"):
-        read_depth(tmp_path / "counts.npy", background=np.ones(5), group_index=1.0, **options)
+        read_depth(tmp_path / "counts.npy", background=np.ones(5), **options)
     with pytest.raises(ArgumentError, match="background is of counts"), warnings.catch_warnings():
         warnings.simplefilter("ignore")
-        read_depth(tmp_path / "counts.npy", background="flat", group_index=1.0, bin_width=130e-12, gate_start=0.0)
+        read_depth(tmp_path / "counts.npy", background="flat", **facts)
     np.save(tmp_path / "depth.npy", np.full((16, 16), 14.6))
     with pytest.raises(ArgumentError, match="holds depth: background are of histograms"):
         read_depth(tmp_path / "depth.npy", background="flat")

@@ -65,7 +65,6 @@ def test_a_seed_gives_the_same_weights(model, device, tmp_path, monkeypatch):
     optimiser |= {"report_every": steps}
     tables = {"model": model, "seed": 3, "optimiser": optimiser, "noise": {"counting": 1.0} if counting else {}}
     recipe, few = TrainingRecipe.from_dict(tables), procedural_scenes(1, 32, seed=1, device="cpu")
-    first, second = (
-        load_file(training.fit(recipe, None, few, tmp_path / name, device=device).weights) for name in "ab"
-    )
+    runs = (training.fit(recipe, None, few, tmp_path / name, device=device) for name in "ab")
+    first, second = (load_file(run.weights) for run in runs)
     assert all(torch.equal(values, second[name]) for name, values in first.items())

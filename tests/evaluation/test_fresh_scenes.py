@@ -46,9 +46,8 @@ def test_every_family_gives_numbers():
 def test_scores_are_those_of_the_estimates():
     found = evaluate_fresh(scenes=1, seed=11, device="cpu")
     scene, score = fresh_scene(11, 0, device="cpu"), found.scenes[0]
-    part = classical_depth(
-        scene.counts, background=scene.background, response=scene.response, method="pooled", tuning=5
-    )
+    facts = {"background": scene.background, "response": scene.response}
+    part = classical_depth(scene.counts, **facts, method="pooled", tuning=5)
     depth = scene.gate[0] + (scene.gate[1] - scene.gate[0]) * part[0]
     error = (depth - scene.clean)[np.isfinite(scene.clean)]
     assert score.rmse["pooled 5"] == pytest.approx(np.sqrt(np.mean(error**2)), rel=1e-4)

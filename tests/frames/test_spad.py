@@ -247,9 +247,8 @@ def test_slopes_of_a_receiver_with_crosstalk_are_differences_of_its_rates():
 
 def test_a_file_holds_what_detect_draws_and_says_what_it_has_not(tmp_path):
     result, options = make_result(make_scene(width=6, height=4)), {"pulses": 1000, "frames": 3, "seed": 2**64 - 1}
-    path = record_frames(
-        result, tmp_path / "frames.h5", **options, methods=("centroid", "peak"), device="cpu"
-    ).file.path
+    path, methods = tmp_path / "frames.h5", ("centroid", "peak")
+    assert record_frames(result, path, **options, methods=methods, device="cpu").file.path == path
     file, frames = FramesFile.load(path), spadwarp.detect(result, **options, device="cpu")
     assert np.array_equal(file.counts(), frames.counts) and np.array_equal(file.counts(2), frames.counts[2])
     assert np.array_equal(file.intensity(), frames.intensity)

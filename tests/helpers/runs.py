@@ -12,7 +12,7 @@ from spadwarp.transport import resolve_derivatives
 from spadwarp.transport.model import build_model, transport_spec
 from spadwarp.transport.workers import DeviceWorker
 
-PHOTONS = 300_000
+PHOTONS = 200_000
 RUN = {"photons": PHOTONS, "seed": 5}
 
 

@@ -57,10 +57,8 @@ def png(values):
     return stream.getvalue()
 
 
-IMAGE = {
-    "material": "map_Kd box.png",
-    "image": png(np.random.default_rng(1).integers(255, size=(64, 64, 3), dtype="u1")),
-}
+PIXELS = np.random.default_rng(1).integers(255, size=(64, 64, 3), dtype="u1")
+IMAGE = {"material": "map_Kd box.png", "image": png(PIXELS)}
 
 
 @pytest.mark.parametrize(

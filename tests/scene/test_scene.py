@@ -194,9 +194,3 @@ def test_every_number_has_a_range(model):
         assert interval.high < math.inf or interval.includes_high, path
         named = not INFINITE.isdisjoint({path, path.rpartition(".")[2]})
         assert ("inf" in str(interval)) == (named and not of_a_port), path
-
-
-def test_every_field_is_described():
-    models = [model for section in Scene.model_fields.values() for model in models_of(section)]
-    for model in models:
-        assert all(info.description for info in model.model_fields.values()), model

@@ -182,8 +182,6 @@ def test_names_and_what_is_refused(everywhere, tmp_path):
         resolve_derivatives(one, [NAMES[0], NAMES[1], NAMES[1]])
     with pytest.raises(spadwarp.ArgumentError, match="photon records have no derivatives by block"):
         trace(one, photons=100, device="cpu", derivatives=NAMES[:1])
-    large = {"width": 2000, "height": 2000}
+    large = scene(medium={"grid": everywhere}, camera={"width": 2000, "height": 2000})
     with pytest.raises(spadwarp.ConfigError, match="fewer pixels, bins or blocks"):
-        simulate(
-            scene(medium={"grid": everywhere}, camera=large), derivatives=WITH_TARGET, blocks=(8, 6, 10), photons=10
-        )
+        simulate(large, derivatives=WITH_TARGET, blocks=(8, 6, 10), photons=10)

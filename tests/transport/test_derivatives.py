@@ -70,9 +70,8 @@ def test_single_scatter_in_closed_form(device):
     np.testing.assert_allclose(by_b, h / 0.24 + by_a, rtol=1e-4)
     assert within_path_limits(result)
     step = 1e-3
-    higher, lower = (
-        single_scatter(Lidar(**{**vars(LIDAR), "anisotropy": 0.6 + k * step})).sum(axis=(0, 1)) for k in (1, -1)
-    )
+    beside = (Lidar(**{**vars(LIDAR), "anisotropy": 0.6 + k * step}) for k in (1, -1))
+    higher, lower = (single_scatter(one).sum(axis=(0, 1)) for one in beside)
     expected = (higher - lower) / (2 * step) / single_scatter(LIDAR).sum(axis=(0, 1))
     np.testing.assert_allclose(by_g / h, expected, rtol=2e-3)
 
@@ -97,11 +96,8 @@ def test_layers_share_the_derivatives_of_one_water(device):
     layers = [{**water, "start": 0.7}, {**water, "start": 1.6, "anisotropy": 0.8}]
     whole = simulated(scene(), device, [ALL[0], ALL[1], ALL[3]], 50_000)
     parts = {}
-    for place, inherits in (
-        ("medium", "medium"),
-        ("medium.layers[0]", "medium"),
-        ("medium.layers[1]", "medium.layers[1]"),
-    ):
+    own = "medium.layers[1]"
+    for place, inherits in (("medium", "medium"), ("medium.layers[0]", "medium"), (own, own)):
         names = [f"{place}.absorption", f"{place}.scattering", f"{inherits}.anisotropy", ALL[3]]
         result = simulated(layered({"layers": layers}), device, names, 50_000)
         np.testing.assert_allclose(result.tallies, whole.tallies, rtol=1e-4, atol=100)  # on a GPU not to the bit

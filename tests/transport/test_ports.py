@@ -168,9 +168,8 @@ def single_scatter(faces, window, edges):
     ends = [brentq(lambda s, edge=edge: at(s)[0] - edge, 0.3, 5.0, xtol=1e-7) for edge in edges]
     node, weight = np.polynomial.legendre.leggauss(8)
     points = [(0.5 * (b - a), 0.5 * (a + b)) for a, b in itertools.pairwise(ends)]
-    return np.array(
-        [half * sum(w * at(m + half * t)[1] for t, w in zip(node, weight, strict=True)) for half, m in points]
-    )
+    rule = list(zip(node, weight, strict=True))
+    return np.array([half * sum(w * at(m + half * t)[1] for t, w in rule) for half, m in points])
 
 
 def scattered_once(name, estimator="guided"):

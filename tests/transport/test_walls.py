@@ -95,9 +95,8 @@ def test_light_in_a_white_box_stays_and_fills_it(device):
 
 def test_the_domain_stands_in_the_world(device):
     """Photons end on the faces of the box that the ledger names; one is a mirror."""
-    one = beam(
-        [0.2, 0.1, 1.0], {**BOX, "outside_index": {"z_low": 1e9}}, medium={"extinction": 2.0}, max_collisions=1000
-    )
+    mirror = {**BOX, "outside_index": {"z_low": 1e9}}
+    one = beam([0.2, 0.1, 1.0], mirror, medium={"extinction": 2.0}, max_collisions=1000)
     records = trace(one, photons=20_000, seed=1, device=device)
     for index, axis in enumerate("xyz"):
         for side, corner in (("low", BOX["lower"]), ("high", BOX["upper"])):

@@ -21,20 +21,15 @@ from spadwarp.viz.result import merged_edges, merged_means
 NAMES = ["depth.png", "intensity.png", "histogram.png", "truth.png"]
 
 
+CASES = {"empty": {"targets": []}, "far away": {"distance": 1000.0}, "a pixel": {"width": 1, "height": 1, "bins": 8}}
+
+
 @pytest.mark.parametrize(
-    "result",
-    [
-        make_result(make_scene(targets=[]), empty=True),
-        pytest.param(
-            dataclasses.replace(make_result(make_scene(distance=1000.0)), partial=True, seed=2**64 - 1),
-            marks=pytest.mark.slow,
-        ),
-        make_result(make_scene(width=1, height=1, bins=8)),
-    ],
-    ids=["empty", "far away", "a pixel"],
+    "case", [one if one == "empty" else pytest.param(one, marks=pytest.mark.slow) for one in CASES]
 )
-def test_every_result_is_shown(result, tmp_path):
-    paths = draw_result(result, tmp_path, method="peak")
+def test_every_result_is_shown(case, tmp_path):
+    result = make_result(make_scene(**CASES[case]), empty=case == "empty")
+    paths = draw_result(dataclasses.replace(result, partial=True, seed=2**64 - 1), tmp_path, method="peak")
     assert paths == [tmp_path / name for name in NAMES] and sorted(tmp_path.iterdir()) == sorted(paths)
     assert all(200 < side < 4000 for path in paths for side in imread(path).shape[:2])
 

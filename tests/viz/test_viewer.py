@@ -116,10 +116,7 @@ def test_a_page_of_frames_holds_counts_to_the_last(frames):
     bright = expected > 2e-7 * expected.max()
     np.testing.assert_allclose(values[bright], expected[bright], rtol=0.034)
     np.testing.assert_array_equal(unpacked(data["images"]["depth"], "<f4", depth.shape), depth)
-    for wrong, words in (
-        ({"frame": 2}, r"frame = 2 is outside \[0, 2\)"),
-        ({"method": "likelihood"}, "peak, centroid"),
-    ):
+    for wrong, words in (({"frame": 2}, r"frame = 2 is outside \[0, 2"), ({"method": "likelihood"}, "peak, centroid")):
         with pytest.raises(ValueError, match=words):
             spadwarp.viz.view(frames, **wrong)
 

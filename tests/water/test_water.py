@@ -183,10 +183,8 @@ def test_light_is_scattered_by_the_water_itself(tmp_path):
 
 def test_henyey_greenstein_in_natural_water_is_told():
     """Against the laws' own formulas: molecules with a depolarisation of 0.039, Fournier and Forand."""
-    layers = {
-        "chlorophyll": 0.05,
-        "layers": [{"start": 2.0, "chlorophyll": 20.0}, {"start": 3.0, "preset": "uwoc-clear"}],
-    }
+    below = [{"start": 2.0, "chlorophyll": 20.0}, {"start": 3.0, "preset": "uwoc-clear"}]
+    layers = {"chlorophyll": 0.05, "layers": below}
     found = [one for one in spadwarp.check(scene(layers)) if one.field.endswith("anisotropy")]
     assert [one.field for one in found] == [f"medium.{name}anisotropy" for name in ("", "layers[0].", "layers[1].")]
     b_water, g = pure_water_scattering(532.0, salinity=35.0), 0.924

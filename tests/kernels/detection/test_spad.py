@@ -58,10 +58,8 @@ def first_photon(hazard, **options):
 
 def events(hazard, *, pulses, recorded=BINS, edges=None, **options):
     edges = np.linspace(0, PERIOD, BINS + 1) if edges is None else edges
-    options = {"period": PERIOD, "seed": 6, **options}
-    counts, stream = event_counts(
-        array(np.atleast_2d(hazard)), edges=edges, recorded=recorded, pulses=pulses, **options
-    )
+    options = {"period": PERIOD, "seed": 6, "recorded": recorded, "pulses": pulses, **options}
+    counts, stream = event_counts(array(np.atleast_2d(hazard)), edges=edges, **options)
     return counts.numpy(), stream
 
 

@@ -80,16 +80,8 @@ def test_flight_samples_follow_their_density(law, extinction, flight, device):
     medium.anisotropy = G
     medium.phase = make_phase_tables(lambda t: fournier_forand_density(t, 1.10, 3.5835), device=device)
     xi = np.minimum(rng.random((2, 500_000 if device == "cpu" else 10_000_000)), 1 - 2.0**-24).astype(np.float32)
-    inputs = [
-        wp.vec3(*x),
-        wp.vec3(*u / np.linalg.norm(u)),
-        wp.vec2(s0, s1),
-        extinction,
-        medium,
-        *xi,
-        Layers(),
-        wp.vec3(),
-    ]
+    ray = (wp.vec3(*x), wp.vec3(*u / np.linalg.norm(u)))
+    inputs = [*ray, wp.vec2(s0, s1), extinction, medium, *xi, Layers(), wp.vec3()]
     sample = each(sample_flight, inputs, [FlightSample], device)
     s, p = sample["s"].astype(float), sample["density"]
     assert s.min() >= np.float32(s0) and s.max() <= np.float32(s1)

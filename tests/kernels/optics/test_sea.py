@@ -154,9 +154,8 @@ def test_sampled_directions_follow_the_density(angle, above):
     theta = math.radians(angle)
     u = np.array([math.sin(theta), 0.0, -math.cos(theta) if above else math.cos(theta)])
     rows = np.broadcast_to(u.astype(np.float32), (count, 3)).copy()
-    v, part, _ = launched(
-        passage_kernel, [sea, rows, above, *map(words, rng.random((3, count)))], (wp.vec3, float, int)
-    )
+    inputs = [sea, rows, above, *map(words, rng.random((3, count)))]
+    v, part, _ = launched(passage_kernel, inputs, (wp.vec3, float, int))
     left = rng.random(count) < part
     edges = [np.linspace(-1.0, 1.0, 9)] * 3
     observed = np.histogramdd(v[left], edges)[0].ravel()

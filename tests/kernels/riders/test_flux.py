@@ -70,9 +70,8 @@ def test_lengths_in_voxels_and_gates_are_those_of_dense_points():
         inside = ((cell >= 0) & (cell < (4, 5, 6))).all(axis=1) & (gate >= 0) & (gate < 3)
         np.add.at(expected, (gate[inside], *cell[inside].T), 0.5 * 3.0 / 4_000)
     # A point more or less at each end of a way in a voxel.
-    assert (
-        np.abs(tally.numpy().reshape(expected.shape) / (SCALE * 512) - expected).max() < 60 * 2 * 0.5 * 3.0 / 4_000 / 8
-    )
+    found = tally.numpy().reshape(expected.shape) / (SCALE * 512)
+    assert np.abs(found - expected).max() < 60 * 2 * 0.5 * 3.0 / 4_000 / 8
 
 
 @wp.kernel
@@ -122,9 +121,8 @@ def test_light_through_planes_of_even_radiance():
 
 
 def box(estimator, edge=1.0, size=40):
-    return sk.make_flux_volume(
-        (size,) * 3, lower=[-0.5 * size * edge] * 3, edge=[edge] * 3, estimator=estimator, scale=SCALE
-    )
+    where = {"lower": [-0.5 * size * edge] * 3, "edge": [edge] * 3}
+    return sk.make_flux_volume((size,) * 3, **where, estimator=estimator, scale=SCALE)
 
 
 @functools.cache

@@ -92,10 +92,7 @@ BOX_ON_BODY_2 = sk.make_shapes(["box"], [(1, 1, 1)], body=[2], device="cpu")
         (lambda: sk.SpadCamera(frame="usd", device="cpu"), "frame = 'usd' is not one of 'optical', 'opengl'"),
         (lambda: sk.SpadCamera(cameras=2, world=[0], device="cpu"), r"world has shape \(1,\); \(2,\)"),
         (lambda: sk.SpadTracer(boxes(worlds=2), SMALL, 3), "world = 2 is none of the 2 worlds"),
-        (
-            lambda: sk.SpadTracer(BOX_ON_BODY_2, SMALL, estimator="analog"),
-            "estimator = 'analog' is not one of 'guided'",
-        ),
+        (lambda: sk.SpadTracer(BOX_ON_BODY_2, SMALL, estimator="analog"), "estimator = 'analog' is not one of 'guid"),
         # Kernels would read beyond the arrays.
         (lambda: camera().update(BOX_ON_BODY_2, poses(STILL), None), "body_q has 0 poses; the shapes are on 3 bodies"),
         (lambda: camera().update(BOX_ON_BODY_2, poses(STILL), poses(STILL, STILL)), "body_q has 2 poses; the shapes"),
