@@ -50,7 +50,7 @@ class Exposure:
 
     def warnings(self) -> list[str]:
         """Sentences on simulated counts that hold more noise than their photons have."""
-        if self.noise_ratio is None or self.noise_ratio <= NOISE_GOAL:
+        if self.noise_ratio is None or not NOISE_GOAL < self.noise_ratio < math.inf:  # infinite: no light at all
             return []
         return [
             f"the counts are simulated, and the simulation traced too few photons for {self.pulses} pulses: its noise, "

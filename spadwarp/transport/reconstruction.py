@@ -245,7 +245,8 @@ def _first_bin(scene: Scene, mesh: TriangleMesh | None) -> int:
     while True:
         middle = corners.mean(axis=1)
         reach = np.linalg.norm(corners - middle[:, None], axis=-1).max(axis=1)
-        path = -lens * np.linalg.norm(middle[:, :2], axis=-1) / np.linalg.norm(middle, axis=-1) - begin
+        away = np.maximum(np.linalg.norm(middle, axis=-1), 1e-30)  # a face may go through the lens
+        path = -lens * np.linalg.norm(middle[:, :2], axis=-1) / away - begin
         for way in ways:  # behind a port as in its air, whose index is about 1
             straight = np.linalg.norm(middle - way.laser, axis=-1) / scene.medium.group_index
             path += np.fmax(way.light_at(middle)[2], straight)
