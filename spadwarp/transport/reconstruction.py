@@ -250,7 +250,7 @@ def _first_bin(scene: Scene, mesh: TriangleMesh | None) -> int:
         for way in ways:  # behind a port as in its air, whose index is about 1
             straight = np.linalg.norm(middle - way.laser, axis=-1) / scene.medium.group_index
             path += np.fmax(way.light_at(middle)[2], straight)
-        least = path - 2.0 * reach
+        least = path - (2.0 + lens / away) * reach
         near, shortest = least <= path.min(), least.min()
         if reach[near].max() < enough or near.sum() > _RAYS:
             break
