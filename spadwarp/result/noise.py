@@ -24,7 +24,7 @@ NOISE_GOAL = 0.1
 """`Result.target_noise_ratio` up to which a result's noise does not show beside that of a frame's photons: it adds 5 %
 to their standard deviation."""
 
-UNKNOWN_NOISE = "the noise of the simulation is not known: the result keeps no standard errors"
+UNKNOWN_NOISE = "the noise of the simulation is not known: the result keeps no standard errors; more photons give them"
 
 _FWHM_PER_SIGMA = math.sqrt(8.0 * math.log(2.0))
 _NARROW = 0.2  # standard deviation [bins] of a response that leaves light in its bin
