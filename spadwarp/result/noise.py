@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from spadwarp.arrays import Floats
 from spadwarp.io.text import duration
 from spadwarp.scene import Detector, Laser, Scene, noise_rate
-from spadwarp.values import check_real
+from spadwarp.values import check_real, count
 
 if TYPE_CHECKING:
     from spadwarp.result.result import Result
@@ -164,4 +164,5 @@ def noise_caption(ratio: float | None) -> str:
     """For the caption of a picture of frames that show the noise of the simulation; else empty."""
     if ratio is None or ratio <= NOISE_GOAL:
         return ""
-    return f"; too few photons traced: noise of the simulation is {ratio:.2g} times the variance of the photons"
+    times = f"{ratio:.2g}" if ratio < 100.0 else count(float(f"{ratio:.2g}"))
+    return f"; too few photons traced: noise of the simulation is {times} times the variance of the photons"

@@ -402,9 +402,16 @@ def _flux_figure(result: Result, width: float) -> Figure:
     if not sections:
         raise ConfigError("kind = 'flux' needs a result with [[flux]]", source=result.scene.source)
     across = 2 if width > 5.0 else 1
-    figure = style.new_figure(width, 2.7 * len(sections) * 2 / across)
+    heights = []
+    for section in sections:
+        height = 2.7
+        if section.positions is None:  # slices as wide as their place
+            x, y, z = np.subtract(section.upper, section.lower)
+            height = float(np.clip((width / across - 1.5) * max(x, y) / z + 0.75, 1.4, 4.5))
+        heights += [height] * (2 // across)
+    figure = style.new_figure(width, sum(heights))
     figure.caption(_caption(result))
-    axes = figure.subplots(2 * len(sections) // across, across, squeeze=False).reshape(-1, 2)
+    axes = figure.subplots(len(heights), across, squeeze=False, height_ratios=heights).reshape(-1, 2)
     for section, (left, right) in zip(sections, axes, strict=True):
         if section.positions is None:
             for axis, planes in ((left, "zx"), (right, "zy")):
