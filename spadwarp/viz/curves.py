@@ -195,6 +195,8 @@ def draw_validation(rows: Sequence[Mapping[str, Any]], path: str | Path, *, titl
     ratio.set(xlabel="value / reference − 1", ylim=(len(rows) - 0.5, -0.5))
     ratio.set_yticks(range(len(rows)), names)
     deviation.axvspan(-2.0, 2.0, color="0.92", zorder=0)
+    reach = 1.1 * max(2.5, *(abs(row["z"]) for row in rows if math.isfinite(row["z"])), 0.0)
+    deviation.set_xlim(-reach, reach)
     deviation.set_xlabel(wrapped("z [standard errors]; grey: within 2", 0.22 * width))
     for axis in (ratio, deviation):
         axis.locator_params(axis="x", nbins=4)

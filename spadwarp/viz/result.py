@@ -407,7 +407,7 @@ def _flux_figure(result: Result, width: float) -> Figure:
         height = 2.7
         if section.positions is None:  # slices as wide as their place
             x, y, z = np.subtract(section.upper, section.lower)
-            height = float(np.clip((width / across - 1.5) * max(x, y) / z + 0.75, 1.4, 4.5))
+            height = float(np.clip((width / across - 1.5) * max(x, y) / z + 0.75, 1.4, 3.6))
         heights += [height] * (2 // across)
     figure = style.new_figure(width, sum(heights))
     figure.caption(_caption(result))
@@ -472,7 +472,7 @@ def _slice(figure: Figure, axis: Axes, section: str, light: FluxValues, planes: 
     look: Any = {"norm": LogNorm(_LEAST * top, top), "cmap": style.colour_map(INTENSITY_MAP)}
     look |= {"interpolation": "nearest", "extent": (*ends[0], ends[1][1], ends[1][0])}
     shown = axis.imshow(np.maximum(found.sum(axis=0), _LEAST * top), **look)
-    figure.colorbar(shown, ax=axis, label="fluence [1/m²] per photon", shrink=0.6)
+    figure.colorbar(shown, ax=axis, label="fluence per\nphoton [1/m²]", shrink=0.9)
 
 
 # Bins wide enough to mean something

@@ -441,6 +441,8 @@ def _screen(
         extent = (left, right, bottom, top)
         drawn.append(axis.imshow(np.zeros(shape[:2]), cmap=colours, norm=scale, extent=extent))
         figure.colorbar(drawn[-1], cax=bar, orientation="horizontal", label=label, extend="both")
+        if not isinstance(scale, LogNorm):
+            bar.locator_params(axis="x", nbins=4)  # counts may have five digits
     return figure, drawn
 
 
