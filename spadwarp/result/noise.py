@@ -138,8 +138,7 @@ def photons_needed(result: Result, noise_ratio: float = NOISE_GOAL) -> PhotonsNe
     """
     goal = check_real("noise_ratio", noise_ratio, "(0, inf)")
     photons = result.photons * result.target_noise_ratio / goal
-    seconds = result.timing.get("trace", math.nan)
-    return PhotonsNeeded(photons, photons * seconds / result.photons)
+    return PhotonsNeeded(photons, photons * result.timing.get("trace", math.nan) / result.photons)
 
 
 def noise_problem(result: Result) -> str:

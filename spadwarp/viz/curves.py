@@ -86,7 +86,7 @@ def draw_sweep(curves: Sweep, path: str | Path | None = None, *, width: float = 
             axis.plot(place, hollow, "o", color=style_of["color"], markerfacecolor="white", markevery=every, zorder=3)
             for mark, cases in (("x", np.isinf(y[own])), ("$?$", unjudged[own])):
                 some, top = place[cases][::every], axis.get_xaxis_transform()
-                axis.scatter(some, np.full(len(some), 0.97), 25.0, style_of["color"], mark, transform=top)
+                axis.scatter(some, np.full(len(some), 0.97), 25.0, style_of["color"], marker=mark, transform=top)
         if name == "sigma_depth" and curves.fields == ("range", "water"):
             asked = f"depth error of {100 * TOLERANCE:g} cm"
             axis.axhline(TOLERANCE * 1e3, color="0.4", linewidth=0.8, linestyle=":", label=asked)
@@ -197,7 +197,9 @@ def draw_validation(rows: Sequence[Mapping[str, Any]], path: str | Path, *, titl
     deviation.axvspan(-2.0, 2.0, color="0.92", zorder=0)
     reach = 1.1 * max(2.5, *(abs(row["z"]) for row in rows if math.isfinite(row["z"])), 0.0)
     deviation.set_xlim(-reach, reach)
-    deviation.set_xlabel(wrapped("z [standard errors]; grey: within 2", 0.22 * width))
+    deviation.set_xlabel(wrapped("z (grey: within 2)", 0.22 * width))
+    if not any(row["reference"] for row in rows):
+        style.middle_text(ratio, "every reference is 0", color="0.35")
     for axis in (ratio, deviation):
         axis.locator_params(axis="x", nbins=4)
         axis.xaxis.minorticks_on()

@@ -218,12 +218,7 @@ def draw_dataset(
 
     Photons are shown relative to the brightest 0.5 % of each frame, which the frame's title gives.
 
-    Args:
-        folder: The dataset.
-        path: The picture.
-        split: "train", "validation", "test" or "all".
-        frames: At most so many, 1 to 1000.
-        width: Of the picture [inch].
+    `split`: "train", "validation", "test" or "all"; `frames`: at most so many, 1 to 1000; `width`: [inch].
 
     Raises `FileError` where there is no dataset or the picture cannot be written, `ArgumentError`.
     """
