@@ -24,7 +24,7 @@ from spadwarp.frames.cramer_rao import crlb_from_histogram
 from spadwarp.frames.depth import arrival_time
 from spadwarp.frames.response import detector_response
 from spadwarp.scene.sight import depth_from_time, port_advance
-from spadwarp.values import SEED, SpadwarpError, check_choice, check_integer, check_real, range_from_time
+from spadwarp.values import SEED, SpadwarpError, check_choice, check_integer, check_real, count, range_from_time
 from spadwarp.viz import evaluation as drawing
 
 if TYPE_CHECKING:
@@ -257,7 +257,7 @@ def photon_sweep(
     scene, depth = result.scene, np.nanmedian(truth)
     extinction = scene.medium.extinction
     summary = (
-        f"Monte Carlo histograms of {result.photons:.2g} photons, water c = {extinction:.3g} 1/m, target at "
+        f"Monte Carlo histograms of {count(result.photons)} photons, water c = {extinction:.3g} 1/m, target at "
         f"{depth:.3g} m ({depth * extinction:.2g} attenuation lengths), gate of {scene.gate.bins} bins of "
         f"{1e12 * scene.gate.bin_width:.3g} ps; seed {seed}"
     )

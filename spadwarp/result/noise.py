@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from spadwarp.arrays import Floats
 from spadwarp.io.text import duration
 from spadwarp.scene import Detector, Laser, Scene, noise_rate
-from spadwarp.values import check_real
+from spadwarp.values import check_real, count
 
 if TYPE_CHECKING:
     from spadwarp.result.result import Result
@@ -138,8 +138,7 @@ def photons_needed(result: Result, noise_ratio: float = NOISE_GOAL) -> PhotonsNe
     """
     goal = check_real("noise_ratio", noise_ratio, "(0, inf)")
     photons = result.photons * result.target_noise_ratio / goal
-    seconds = result.timing.get("trace", math.nan)
-    return PhotonsNeeded(photons, photons * seconds / result.photons)
+    return PhotonsNeeded(photons, photons * result.timing.get("trace", math.nan) / result.photons)
 
 
 def noise_problem(result: Result) -> str:
@@ -164,4 +163,5 @@ def noise_caption(ratio: float | None) -> str:
     """For the caption of a picture of frames that show the noise of the simulation; else empty."""
     if ratio is None or ratio <= NOISE_GOAL:
         return ""
-    return f"; too few photons traced: noise of the simulation is {ratio:.2g} times the variance of the photons"
+    times = f"{ratio:.2g}" if ratio < 100.0 else count(float(f"{ratio:.2g}"))
+    return f"; too few photons traced: noise of the simulation is {times} times the variance of the photons"

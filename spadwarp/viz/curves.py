@@ -49,8 +49,8 @@ def draw_sweep(curves: Sweep, path: str | Path | None = None, *, width: float = 
     Of budgets those of `draw_budget`; of plans pulses for the depth error, bound, largest range. Linear axes begin
     at 0, and a curve that varies by less than a tenth has its span written into the panel. Dashed: a bound that is not
     reached, since more than 1 % of the fits would be outliers. Hollow: of a gate that was moved to the return, which
-    leaves the light of near water out. A cross at the top: out of reach. Returns the figure of
-    this width [inch], and writes it where `path` is given.
+    leaves the light of near water out. A cross at the top: out of reach; a question mark: not
+    judged by so few photons. Returns the figure of this width [inch], and writes it where `path` is given.
     """
     names, budgets = list(_OF_BUDGETS), isinstance(curves.rows[0], BudgetRow)
     if not budgets:
@@ -64,6 +64,8 @@ def draw_sweep(curves: Sweep, path: str | Path | None = None, *, width: float = 
     groups = list(dict.fromkeys(map(repr, others)))
     missed = curves.column("outlier_probability") > OUTLIERS if budgets else np.zeros(len(at), bool)
     moved = curves.column("gate_moved").astype(bool) if budgets else np.zeros(len(at), bool)
+    unjudged = np.zeros(len(at), bool) if budgets else np.isnan(curves.column("pulses"))
+    unjudged &= not unjudged.all()  # then the panels say so
     for axis, name in zip(axes, names, strict=True):
         label, scale, (least, most) = _COLUMNS[name]
         y = curves.column(name) * scale
@@ -82,32 +84,36 @@ def draw_sweep(curves: Sweep, path: str | Path | None = None, *, width: float = 
             axis.errorbar(place, shown, spread, fmt="o-" if numeric else "o", capsize=2.0, markevery=every, **style_of)
             hollow = np.where(moved[own], shown, np.nan)
             axis.plot(place, hollow, "o", color=style_of["color"], markerfacecolor="white", markevery=every, zorder=3)
-            beyond, top = place[np.isinf(y[own])][::every], axis.get_xaxis_transform()
-            axis.plot(beyond, np.full(len(beyond), 0.97), "x", transform=top, color=style_of["color"])
+            for mark, cases in (("x", np.isinf(y[own])), ("$?$", unjudged[own])):
+                some, top = place[cases][::every], axis.get_xaxis_transform()
+                axis.scatter(some, np.full(len(some), 0.97), 25.0, style_of["color"], marker=mark, transform=top)
         if name == "sigma_depth" and curves.fields == ("range", "water"):
             asked = f"depth error of {100 * TOLERANCE:g} cm"
             axis.axhline(TOLERANCE * 1e3, color="0.4", linewidth=0.8, linestyle=":", label=asked)
         label = label if len(label) < 26 else label.replace(" [", "\n[")  # longer than an axis
         axis.set(xlabel=curves.fields[0] + _unit(curves.fields[0]), ylabel=label)
         _value_axis(axis, np.array([y, *ends]))
+        if numeric:  # also where there is nothing to show
+            axis.update_datalim(np.column_stack([x, x]), updatey=False)
         if np.isnan(y).all():
             style.middle_text(axis, "not enough photons\nto judge")
             axis.tick_params(axis="y", which="both", left=False, labelleft=False)
-            if numeric and np.ptp(x) > 0.0:
-                axis.set_xlim(x.min(), x.max())
         if not numeric:
             axis.set_xticks(range(len(ticks)), ticks, rotation=20, ha="right", rotation_mode="anchor")
             axis.set_xlim(-0.5, len(ticks) - 0.5)
         elif x.min() > 0 and x.max() > (2 if curves.fields[0] == "range" else 30) * x.min():
             log_axis(axis, "x")
         else:
+            axis.locator_params(axis="x", nbins=5)
             axis.xaxis.minorticks_on()
     marks = {"--" if numeric else "_": (missed, f"not reached: over {100 * OUTLIERS:g} % false peaks")}
     marks |= {"o": (moved, "gate moved to the return")}
     marks |= {"x": (np.isinf(curves.column("pulses_for_1cm" if budgets else "pulses")), "out of reach")}
+    marks |= {"$?$": (unjudged, "not enough photons to judge")}
     marks = {mark: (where, label) for mark, (where, label) in marks.items() if where.any()}
     for mark, (_, label) in marks.items():
-        axes[0].plot([], [], mark, color="0.4", markerfacecolor="white", linewidth=0.8, label=label)
+        look = {"linestyle": mark} if mark == "--" else {"linestyle": "none", "marker": mark, "markersize": 5.0}
+        axes[0].plot([], [], **look, color="0.4", markerfacecolor="white", linewidth=0.8, label=label)
     if len(groups) > 1 or marks:
         figure.key(axes, 2.3, title=", ".join(name + _unit(name) for name in curves.fields[1:]))
     if path is not None:
@@ -189,7 +195,11 @@ def draw_validation(rows: Sequence[Mapping[str, Any]], path: str | Path, *, titl
     ratio.set(xlabel="value / reference − 1", ylim=(len(rows) - 0.5, -0.5))
     ratio.set_yticks(range(len(rows)), names)
     deviation.axvspan(-2.0, 2.0, color="0.92", zorder=0)
-    deviation.set_xlabel(wrapped("z [standard errors]; grey: within 2", 0.22 * width))
+    reach = 1.1 * max(2.5, *(abs(row["z"]) for row in rows if math.isfinite(row["z"])), 0.0)
+    deviation.set_xlim(-reach, reach)
+    deviation.set_xlabel(wrapped("z (grey: within 2)", 0.22 * width))
+    if not any(row["reference"] for row in rows):
+        style.middle_text(ratio, "every reference is 0", color="0.35")
     for axis in (ratio, deviation):
         axis.locator_params(axis="x", nbins=4)
         axis.xaxis.minorticks_on()

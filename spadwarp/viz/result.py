@@ -61,16 +61,10 @@ def plot(
 ) -> Figure:
     """A figure of a result, of frames or of a scene; notebooks show it, `savefig` writes it.
 
-    Args:
-        shown: A result: `kind` is "depth" (default), "intensity", "histogram", "truth" or "flux". Frames: one of them,
-            from a file with its depth. An analytic result: its maps and a frame. A fit: its counts and residuals. A
-            scene: true depth and reflectance, by ray casting.
-        kind: Of a result's figure.
-        method: Estimator of a result's depth.
-        frame: Number of the frame, from 0.
-        pixel: Row and column of one more pixel whose histogram, or counts, are shown.
-        device: Warp device.
-        width: Of the figure [inch]: 7.2 for a journal's page, 3.5 for its column.
+    Of a result, `kind` is "depth" (default), "intensity", "histogram", "truth" or "flux". Frames: one of them, from a
+    file with its depth. An analytic result: its maps and a frame. A fit: its counts and residuals. A scene: true depth
+    and reflectance, by ray casting. `method`: estimator of a result's depth; `frame`: its number, from 0; `pixel`: row
+    and column of one more pixel to show; `width`: [inch], 7.2 for a journal's page, 3.5 for its column.
 
     Raises `ArgumentError` for another kind, a frame that is not there, or a width outside [2.5, 50]; `MeshError` where
     a target of the scene cannot be read.
@@ -114,14 +108,8 @@ def draw_result(
 ) -> list[Path]:
     """Writes pictures of depth, intensity, histograms, truth and flux, such as `depth.png`; returns their paths.
 
-    Args:
-        result: What to show; frames without returns give empty pictures, not errors.
-        directory: The folder; it is made if it is missing.
-        kinds: Which of the pictures.
-        depth: Depth frame `[H, W]` [m] to show; `result.depth(method=method)` if not given.
-        method: Estimator of the depth frame, named in the picture.
-        formats: "png", and "pdf" with vectors, for print.
-        width: Of the pictures [inch]: 7.2 for a journal's page, 3.5 for its column.
+    `depth`: frame `[H, W]` [m] to show, by default `result.depth(method=method)`; `formats`: "png", and "pdf" with
+    vectors; `width`: [inch]. Frames without returns give empty pictures. The folder is made if it is missing.
 
     Raises `FileError` where the folder or a file cannot be written.
     """
@@ -402,9 +390,16 @@ def _flux_figure(result: Result, width: float) -> Figure:
     if not sections:
         raise ConfigError("kind = 'flux' needs a result with [[flux]]", source=result.scene.source)
     across = 2 if width > 5.0 else 1
-    figure = style.new_figure(width, 2.7 * len(sections) * 2 / across)
+    heights = []
+    for section in sections:
+        height = 2.7
+        if section.positions is None:  # slices as wide as their place
+            x, y, z = np.subtract(section.upper, section.lower)
+            height = float(np.clip((width / across - 1.5) * max(x, y) / z + 0.75, 1.4, 3.6))
+        heights += [height] * (2 // across)
+    figure = style.new_figure(width, sum(heights))
     figure.caption(_caption(result))
-    axes = figure.subplots(2 * len(sections) // across, across, squeeze=False).reshape(-1, 2)
+    axes = figure.subplots(len(heights), across, squeeze=False, height_ratios=heights).reshape(-1, 2)
     for section, (left, right) in zip(sections, axes, strict=True):
         if section.positions is None:
             for axis, planes in ((left, "zx"), (right, "zy")):
@@ -465,7 +460,7 @@ def _slice(figure: Figure, axis: Axes, section: str, light: FluxValues, planes: 
     look: Any = {"norm": LogNorm(_LEAST * top, top), "cmap": style.colour_map(INTENSITY_MAP)}
     look |= {"interpolation": "nearest", "extent": (*ends[0], ends[1][1], ends[1][0])}
     shown = axis.imshow(np.maximum(found.sum(axis=0), _LEAST * top), **look)
-    figure.colorbar(shown, ax=axis, label="fluence [1/m²] per photon", shrink=0.6)
+    figure.colorbar(shown, ax=axis, label="fluence per\nphoton [1/m²]", shrink=0.9)
 
 
 # Bins wide enough to mean something
@@ -732,8 +727,7 @@ def progress_bar(unit: str = "photons") -> Callable[[str, int, int], None]:
 
         spadwarp.simulate(scene, photons=2e6, progress=spadwarp.viz.progress_bar())
 
-    Args:
-        unit: What is counted, such as "photons", "frames" or "steps".
+    `unit`: what is counted, such as "photons", "frames" or "steps".
     """
     ipython = sys.modules.get("IPython")
     in_notebook = ipython is not None and hasattr(ipython.get_ipython(), "kernel")

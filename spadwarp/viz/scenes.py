@@ -203,8 +203,9 @@ def _sheet_bar(figure: PaperFigure, scale: Normalize, colours: str, label: str) 
     """A colour bar below all images."""
     axes = [axis for axis in figure.axes if axis.images]
     figure.grow(0.5)
-    aspect, shown = 0.8 * figure.get_figwidth() / 0.09, ScalarMappable(scale, colours)
-    bar = figure.colorbar(shown, ax=axes, location="bottom", label=label, shrink=0.8, aspect=aspect, pad=0.04)
+    width, height = figure.get_size_inches()
+    look = {"shrink": 0.8, "aspect": 0.8 * width / 0.09, "pad": 0.1 / height}
+    bar = figure.colorbar(ScalarMappable(scale, colours), ax=axes, location="bottom", label=label, **look)
     bar.outline.set_visible(False)  # type: ignore[operator]
     bar.ax.xaxis.minorticks_on()
 
@@ -217,12 +218,7 @@ def draw_dataset(
 
     Photons are shown relative to the brightest 0.5 % of each frame, which the frame's title gives.
 
-    Args:
-        folder: The dataset.
-        path: The picture.
-        split: "train", "validation", "test" or "all".
-        frames: At most so many, 1 to 1000.
-        width: Of the picture [inch].
+    `split`: "train", "validation", "test" or "all"; `frames`: at most so many, 1 to 1000; `width`: [inch].
 
     Raises `FileError` where there is no dataset or the picture cannot be written, `ArgumentError`.
     """

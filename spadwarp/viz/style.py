@@ -419,7 +419,8 @@ class Panels:
     def show_intensity(self, image: NDArray[Any], title: str, label: str) -> None:
         """From 0 to the 99.5th percentile, which single bright pixels exceed."""
         values = image.astype(np.float64)
-        top = float(np.percentile(values, 99.5)) or float(values.max()) or 1.0
+        known = values[np.isfinite(values)]
+        top = (float(np.percentile(known, 99.5)) or float(known.max()) or 1.0) if known.size else 1.0
         self.show_scaled(values, title, label, INTENSITY_MAP, (0.0, top))
 
     def show_positive(self, values: NDArray[Any], title: str, label: str, colours: str = BOUND_MAP) -> None:
@@ -464,7 +465,7 @@ def shown_limits(
     gate, and those of the target would have one colour.
     """
     known = np.isfinite(image)
-    if weights is not None and weights[known].sum() > 0:
+    if weights is not None and (weights[known] > 0).any():  # those of NaN count for nothing
         known &= weights > 0
         each = weights[known].astype(np.float64)
         ends = np.quantile(image[known], (beyond / 100, 1.0 - beyond / 100), weights=each, method="inverted_cdf")

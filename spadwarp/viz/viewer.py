@@ -422,10 +422,7 @@ def _window(cube: NDArray[np.float64], edges: NDArray[np.float64], window_ns: tu
 
 @paper()
 def _screen(
-    shape: tuple[int, ...],
-    images: Sequence[tuple[str, Normalize, Colormap, str]],
-    width: float,
-    sides: dict[str, Any] | None = None,
+    shape: tuple[int, ...], images: Sequence[tuple[str, Normalize, Colormap, str]], width: float, sides: Any = None
 ) -> tuple[PaperFigure, list[AxesImage]]:
     """The figure of all pictures, and its images; of each its title, scale, colours and label. `sides`: of a plane in
     the world, to the right and downwards, from and to [m]."""
@@ -441,6 +438,8 @@ def _screen(
         extent = (left, right, bottom, top)
         drawn.append(axis.imshow(np.zeros(shape[:2]), cmap=colours, norm=scale, extent=extent))
         figure.colorbar(drawn[-1], cax=bar, orientation="horizontal", label=label, extend="both")
+        if not isinstance(scale, LogNorm):
+            bar.locator_params(axis="x", nbins=4)  # counts may have five digits
     return figure, drawn
 
 
