@@ -67,7 +67,8 @@ def train(recipe: Path, *, out: Path, overrides: list[str] | None = None, device
     """Train a denoiser on scenes that are drawn as it goes, or on the clean scenes of a dataset.
 
     New noise is drawn for each step. Writes weights (safetensors), log.jsonl, curves.png and a checkpoint, also at
-    Ctrl-C or SIGTERM; the same command resumes the training. Another recipe needs a new folder.
+    Ctrl-C or SIGTERM; the same command resumes the training. Another recipe needs a new folder. Prints the PSNR [dB] of
+    the network and of its input: on noisy frames of the dataset's validation split, else on drawn scenes.
 
     Args:
         recipe (RECIPE): Training recipe (TOML), or the name of one of `spadwarp list training`.
@@ -77,15 +78,20 @@ def train(recipe: Path, *, out: Path, overrides: list[str] | None = None, device
     \b
     Example:
       spadwarp train configs/training/pyramid.toml --out runs/pyramid/
-      spadwarp train usdn --set data=data/small/ --set optimiser.steps=2000 --out runs/usdn/
+      spadwarp train short --set data=data/small/ --out runs/short/
     """
     chosen = spadwarp.denoise.load_training_recipe(recipe, overrides or ())
     names = (f"{chosen.model}.safetensors", "log.jsonl", "curves.png", "checkpoint.pt")
     check_outputs(out, names, inputs=(recipe,), resume=True)
     trained = spadwarp.denoise.train(chosen, out, device=device, progress=progress("steps"), notify=note)
-    if trained.psnr < trained.input_psnr:
-        complain("the network makes frames worse than they are: train it for more steps", "warning")
-    answer({name: getattr(trained, name) for name in ("psnr", "input_psnr", "seconds", "weights")})
+    shown = {name: getattr(trained, name) for name in ("psnr", "input_psnr", "seconds", "weights")}
+    if chosen.data is not None and chosen.model != "histograms":  # by the noise of the frames that the user has
+        options: dict[str, Any] = {"models": (), "split": "validation", "frames": 4, "weights": trained.weights}
+        found = spadwarp.evaluation.evaluate(chosen.data, device=device, **options)
+        shown |= {"psnr": found.mean("own").psnr, "input_psnr": found.mean("input").psnr}
+    if shown["psnr"] < shown["input_psnr"]:
+        complain("the network makes frames worse than they are: more steps, or the recipe `short`, help", "warning")
+    answer(shown)
 
 
 _PICTURES = ("metrics", "samples", "rescaled", "detail", "ranking", "photons", "reliability")
@@ -133,8 +139,7 @@ def evaluate(
     \b
     Examples:
       spadwarp evaluate --report report/
-      spadwarp evaluate --fresh 20
-      spadwarp evaluate data/lu2024/ --weights runs/pyramid/pyramid.safetensors --report report/
+      spadwarp evaluate data/small/ --weights runs/short/pyramid.safetensors --report report/
       spadwarp evaluate data/lu2024/ --models bm3d,pyramid --frames 7 --bm3d-frames 20 --crop 128 96
       spadwarp evaluate out/result.h5 --report photons/
     """
@@ -142,25 +147,19 @@ def evaluate(
     chosen = [name.strip() for name in ("median,gating,usdn,dncnn,pyramid" if models == "all" else models).split(",")]
     check_outputs(report, _REPORT, inputs=(data, weights), option="--report")
     options: dict[str, Any] = {"models": chosen, "seed": seed or 0}
-    run: Any
-    write: Any = None
-    show: Any
+    run: Any = evaluation.evaluate_scenes
+    show: Any = _show_scenes
+    write: Any = evaluation.write_scene_report
     if fresh is not None or data is None:
         opt.refuse("is for a dataset", "--split", "--frames", "--bm3d-frames", "--crop")
     if fresh is not None:
         opt.refuse("cannot be combined with --fresh, which makes scenes of its own", "DATA", "--models", "--report")
-        run, show, options = evaluation.evaluate_fresh, _show_fresh, {"scenes": fresh, "seed": seed}
-    elif data is None:
-        run, show, write = evaluation.evaluate_scenes, _show_scenes, evaluation.write_scene_report
-    elif data.is_file() or (data / "result.h5").is_file():
+        run, show, write, options = evaluation.evaluate_fresh, _show_fresh, None, {"scenes": fresh, "seed": seed}
+    elif data is not None and (data.is_file() or (data / "result.h5").is_file()):
         run, show = partial(evaluation.photon_sweep, opt.load_run(data)), _show_photons
-        named = [*chosen, "histograms"] if models == "all" else chosen
-        options["models"] = [name for name in named if name != "bm3d"]
-
-        def write(found: PhotonSweep, folder: Path) -> list[Path]:
-            return [evaluation.draw_photon_sweep(found, folder / "photons.png")]
-
-    else:
+        options["models"] = [name for name in chosen if name != "bm3d"] + ["histograms"] * (models == "all")
+        write = lambda found, folder: [evaluation.draw_photon_sweep(found, folder / "photons.png")]  # noqa: E731
+    elif data is not None:
         run, show, write = partial(evaluation.evaluate, data), _show_gains, evaluation.write_report
         bm3d_frames = bm3d_frames or (20 if "bm3d" in chosen else 0)
         options = {"models": chosen, "split": split, "frames": frames, "bm3d_frames": bm3d_frames, "crop": crop}
@@ -178,9 +177,8 @@ def _show_gains(found: Evaluation) -> None:
     for method in found.ranking():
         row = {"method": titles[method]}
         for level in (*found.levels, None):
-            after, before = found.mean(method, level=level), found.mean("input", level=level)
-            gain = f"{after.psnr:.2f}" if method == "input" else f"{after.psnr - before.psnr:+.2f}"
-            row["mean" if level is None else level] = gain
+            after, before = (found.mean(name, level=level).psnr for name in (method, "input"))
+            row[level or "mean"] = f"{after:.2f}" if method == "input" else f"{after - before:+.2f}"
         table.append(row)
     say(f"PSNR of the input, and gain over it [dB], by backscatter fraction or photons; {found.summary}")
     show_table(table)
