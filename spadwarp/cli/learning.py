@@ -139,6 +139,7 @@ def evaluate(
     \b
     Examples:
       spadwarp evaluate --report report/
+      spadwarp evaluate --fresh 20
       spadwarp evaluate data/small/ --weights runs/short/pyramid.safetensors --report report/
       spadwarp evaluate data/lu2024/ --models bm3d,pyramid --frames 7 --bm3d-frames 20 --crop 128 96
       spadwarp evaluate out/result.h5 --report photons/
@@ -158,7 +159,10 @@ def evaluate(
     elif data is not None and (data.is_file() or (data / "result.h5").is_file()):
         run, show = partial(evaluation.photon_sweep, opt.load_run(data)), _show_photons
         options["models"] = [name for name in chosen if name != "bm3d"] + ["histograms"] * (models == "all")
-        write = lambda found, folder: [evaluation.draw_photon_sweep(found, folder / "photons.png")]  # noqa: E731
+
+        def write(found: PhotonSweep, folder: Path) -> list[Path]:
+            return [evaluation.draw_photon_sweep(found, folder / "photons.png")]
+
     elif data is not None:
         run, show, write = partial(evaluation.evaluate, data), _show_gains, evaluation.write_report
         bm3d_frames = bm3d_frames or (20 if "bm3d" in chosen else 0)
