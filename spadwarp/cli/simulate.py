@@ -313,7 +313,7 @@ def _answer(result: Result, files: RunFiles, **more: Any) -> None:
         "depth_m": [float(returned.min()), float(returned.max())] if returned.size else None,
         "median_depth_error_mm": 1000.0 * float(np.median(error)) if error.size else None,
     }
-    # The relative error is that of the traced light, which the noise ratio is not where light is reconstructed.
+    # The relative error is of traced light: beside the noise ratio of reconstructed light it would mislead.
     errors = ("noise_ratio", "relative_error") if result.reconstruction is None else ("noise_ratio",)
     found |= {name: summary[name] for name in errors if result.batches > 1}
     found["energy_balance"] = "exact" if balance["exact"] else f"OFF BY {balance['difference']} UNITS"

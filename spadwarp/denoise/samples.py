@@ -46,12 +46,9 @@ class Samples:
         turn = step // settings.redraw
         if self.drawn is None or self.drawn[0] != turn:
             seed = (self.recipe.seed * 1_000_003 + turn) * 4096 % 2**62
-            self.drawn = (
-                turn,
-                procedural_scenes(
-                    settings.scenes, self.crop + 32, seed=seed, device=self.generator.device, finer=self.finer
-                ),
-            )
+            side, place = self.crop + 32, self.generator.device
+            scenes = procedural_scenes(settings.scenes, side, seed=seed, device=place, finer=self.finer)
+            self.drawn = turn, scenes
         return self.drawn[1]
 
     def prepare(self, step: int) -> None:

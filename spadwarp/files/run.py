@@ -21,6 +21,7 @@ from spadwarp.io.paths import file_within, remove_temporaries, write_file
 from spadwarp.io.text import write_text
 from spadwarp.parallel import Forked
 from spadwarp.result import Result, load_result, save_depth_exr, save_truth_maps
+from spadwarp.result.file import read_head
 from spadwarp.result.result import difference
 from spadwarp.scene import Scene
 from spadwarp.scene.camera import to_world
@@ -172,10 +173,11 @@ def load_resumable(path: str | Path) -> tuple[Result, Path]:
         file = files[0] if files else file_within(folder, ("result.h5",))
         return load_result(file), file
     try:
-        checkpoint, result = found = [load_result(file) for file in files]
+        checkpoint, result = map(read_head, files)
         one_run = not difference(checkpoint, result) and checkpoint.requested[0] == result.requested[0]
-        chosen = int(one_run and result.photons >= checkpoint.photons)
-        return found[chosen], files[chosen]
+        if one_run and result.photons >= checkpoint.photons:
+            files.reverse()
+        return load_result(files[0]), files[0]
     except FileError as error:
         for file in files:
             with suppress(FileError):

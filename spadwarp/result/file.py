@@ -215,6 +215,12 @@ def as_result(result: ResultLike, name: str = "result") -> Result:
     return result
 
 
+def read_head(path: str | Path) -> ResultHead:
+    """Of the result in a file. Raises `FileError`."""
+    with read_hdf5(path, FORMAT, version=FORMAT_VERSION) as file:
+        return _head(file)
+
+
 def _head(file: Hdf5File) -> ResultHead:
     ranges = tuple((int(start), int(stop)) for start, stop in file.array("photon_ranges", np.uint64, (None, 2)))
     if not ranges or any(start >= stop for start, stop in ranges) or len(joined(ranges)) > len(ranges):
