@@ -193,7 +193,7 @@ def export(
 
     \b
     npy     NumPy: [height, width, bin], with frames before that; depth where there are no counts
-    npz     the same with its axis time [s], bin_width, gate_start and true_depth [m]
+    npz     the same with its axis time [s], bin_width, gate_start, group_index and true_depth [m]
     png     depth in millimetres, 16 bits, as OpenCV and ROS read it; one file a frame
     mat     MATLAB, one file a frame, as single-photon denoisers read: sparse spad, rates, bin from 1, bin_size [s]
     ptu     PicoQuant T3 image, one record a detection
