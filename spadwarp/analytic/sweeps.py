@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 from spadwarp.analytic.budgets import LONGEST, BudgetRow, central_row
 from spadwarp.analytic.planning import plan
 from spadwarp.io.text import parse_toml
+from spadwarp.result import POLARISED
 from spadwarp.scene import Scene, SceneLike, as_scene, parse_override
 from spadwarp.scene.sections import field_unit, locate, parse_key, takes_integers
 from spadwarp.values import (
@@ -176,6 +177,7 @@ def combinations(scene: SceneLike, vary: Any, *, planned: bool) -> tuple[tuple[s
             if field == "range":
                 arguments["ranges"] = (value, value)
             elif field == _ANALYSER:
+                check_choice(f"vary: {_ANALYSER}", value, ("none", *POLARISED))
                 arguments["channel"] = "I" if value == "none" else value
                 if value != "none" and not scene.camera.channels:
                     overrides["camera.polarisation"] = "analyser"
@@ -184,7 +186,7 @@ def combinations(scene: SceneLike, vary: Any, *, planned: bool) -> tuple[tuple[s
             else:
                 overrides[field] = value
         changed = scene.with_overrides(overrides)
-        if "channel" in arguments and changed.laser.polarisation == "none":
+        if arguments.get("channel", "I") != "I" and changed.laser.polarisation == "none":
             text = "is for polarised lasers: laser.polarisation = 'linear'"
             raise ConfigError(f"{_ANALYSER} = {arguments['channel']!r} {text}", source=scene.source)
         chosen.append((values, changed, arguments))

@@ -243,7 +243,7 @@ _Start = Annotated[dict[str, float], opt.numbers("NAME=VALUE")]
 _Prior = Annotated[dict[str, tuple[float, float]], opt.numbers("NAME=MEAN,SD")]
 
 
-@command()
+@command(prints_result=True)
 def fit(
     path: Path,
     scene: Path | None = None,

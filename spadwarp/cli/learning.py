@@ -68,7 +68,8 @@ def train(recipe: Path, *, out: Path, overrides: list[str] | None = None, device
 
     New noise is drawn for each step. Writes weights (safetensors), log.jsonl, curves.png and a checkpoint, also at
     Ctrl-C or SIGTERM; the same command resumes the training. Another recipe needs a new folder. Prints the PSNR [dB] of
-    the network and of its input: on noisy frames of the dataset's validation split, else on drawn scenes.
+    the network and of its input, on drawn scenes; or on noisy frames of the dataset's validation split, where that of
+    the best median filter stands beside them.
 
     Args:
         recipe (RECIPE): Training recipe (TOML), or the name of one of `spadwarp list training`.
@@ -84,21 +85,22 @@ def train(recipe: Path, *, out: Path, overrides: list[str] | None = None, device
     names = (f"{chosen.model}.safetensors", "log.jsonl", "curves.png", "checkpoint.pt")
     check_outputs(out, names, inputs=(recipe,), resume=True)
     trained = spadwarp.denoise.train(chosen, out, device=device, progress=progress("steps"), notify=note)
-    shown = {name: getattr(trained, name) for name in ("psnr", "input_psnr", "seconds", "weights")}
+    shown: dict[str, Any] = {"psnr": trained.psnr, "input_psnr": trained.input_psnr}
     if chosen.data is not None and chosen.model != "histograms":  # by the noise of the frames that the user has
-        options: dict[str, Any] = {"models": (), "split": "validation", "frames": 4, "weights": trained.weights}
+        options: dict[str, Any] = {"models": ["median"], "split": "validation", "frames": 4, "weights": trained.weights}
         found = spadwarp.evaluation.evaluate(chosen.data, device=device, **options)
-        shown |= {"psnr": found.mean("own").psnr, "input_psnr": found.mean("input").psnr}
+        names = {"own": "psnr", "input": "input_psnr", "median": "median_psnr"}
+        shown |= {name: found.mean(method).psnr for method, name in names.items()}
     if shown["psnr"] < shown["input_psnr"]:
         complain("the network makes frames worse than they are: more steps, or the recipe `short`, help", "warning")
-    answer(shown)
+    answer({**shown, "seconds": trained.seconds, "weights": trained.weights})
 
 
 _PICTURES = ("metrics", "samples", "rescaled", "detail", "ranking", "photons", "reliability")
 _REPORT = ("report.html", "scores.json", *(f"{name}.png" for name in _PICTURES))
 
 
-@command()
+@command(prints_result=True)
 def evaluate(
     data: Path | None = None,
     *,

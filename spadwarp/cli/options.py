@@ -33,13 +33,15 @@ SHARED = tomllib.loads((files("spadwarp.cli") / "options.toml").read_text(encodi
 _COMMON = {"overwrite": bool, "quiet": bool, "json": Path | None}
 
 
-def command(*, without: tuple[str, ...] = (), name: str | None = None) -> Callable[[Callable[..., None]], Any]:
+def command(
+    *, without: tuple[str, ...] = (), name: str | None = None, prints_result: bool = False
+) -> Callable[[Callable[..., None]], Any]:
     """Makes a command of a function: its parameters become arguments, those behind `*` options.
 
     Kinds and defaults come from the signature; an annotated function reads the text. Metavar and help are those of the
     docstring's section `Args`, `parameter (METAVAR): help`, else of `SHARED`. A trailing "_" is no part of an option's
     name. Each command has --overwrite, --quiet and --json, which `running` holds, but those that are named in
-    `without`.
+    `without`; `prints_result` also with --quiet.
     """
 
     def register(function: Callable[..., None]) -> Callable[..., None]:
@@ -62,6 +64,7 @@ def command(*, without: tuple[str, ...] = (), name: str | None = None) -> Callab
         def run(**values: Any) -> None:
             for common in _COMMON:
                 setattr(running, common, values.pop(common, None))
+            running.prints_result = prints_result
             running.given = frozenset(names[one] for one, value in values.items() if value != defaults[one])
             function(**{one: _plain(value) for one, value in values.items()})
 

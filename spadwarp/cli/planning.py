@@ -67,7 +67,7 @@ def _warnings(scene: Scene, but: str = "") -> list[str]:
 _Range = Annotated[tuple[float, float], opt.from_to("m")]
 
 
-@command()
+@command(prints_result=True)
 def plan(
     scene: Path,
     *,
