@@ -160,7 +160,7 @@ def combinations(scene: SceneLike, vary: Any, *, planned: bool) -> tuple[tuple[s
     check_integer("number of values to vary", math.prod(len(values) for _, values in curves), f"[1, {LONGEST}]")
     fields = tuple(field for field, _ in curves)
     if not planned and (own := [field for field in fields if field in ("range", _ANALYSER)]):
-        text = "goes with no other field in a budget: vary it alone, or plan each combination, of = 'plan'"
+        text = "is no field of a budget: of = 'plan' varies it with others; `spadwarp.budget` is over range alone"
         raise ArgumentError(f"vary: {own[0]} {text}")
     waves = dict(curves).get("laser.wavelength_nm", ())
     follows = scene.medium.chlorophyll is not None or any(field.startswith("medium.") for field in fields)

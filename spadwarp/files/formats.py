@@ -739,9 +739,8 @@ def _las_header(point_format: int, points: Floats, scene: Scene) -> Any:
     header.scales, header.offsets = np.full(3, _COORDINATE), np.floor(points.min(axis=0))
     header.global_encoding.wkt = True
     header.generating_software = "spadwarp"
-    header.vlrs.append(
-        laspy.VLR("LASF_Spec", 3, "time of flight, SI units", json_text(_axis_of(scene)).encode())
-    )  # 3: text
+    axis = json_text(_axis_of(scene)).encode()
+    header.vlrs.append(laspy.VLR("LASF_Spec", 3, "time of flight, SI units", axis))  # 3: text
     return header
 
 

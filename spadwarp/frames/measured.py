@@ -9,7 +9,7 @@ import logging
 import math
 import re
 import warnings
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import closing, contextmanager
 from functools import partial
 from pathlib import Path
@@ -110,10 +110,13 @@ def read_histograms(
         return _read_own(path, channel)
     if channel != "I":
         raise ArgumentError(f"channel = {channel!r}: only results have channels, not {path}")
-    if path.suffix.lower() == ".ptu":
-        raw = _reading(path, _read_ptu, image_size, sum_frames)
-    else:
-        raw = _reading(path, _read_arrays, dataset, image_size, tag_unit, bin_width)
+    if path.suffix.lower() not in ENDINGS:
+        raise FileError(f"{path}: ending {path.suffix!r} is not one of {', '.join(ENDINGS)}")
+    with reading(path):
+        if path.suffix.lower() == ".ptu":
+            raw = _read_ptu(path, image_size, sum_frames)
+        else:
+            raw = _read_arrays(path, dataset, image_size, tag_unit, bin_width)
     if idle := [name for name, value in given.items() if value is not None and name not in raw.options]:
         raise ArgumentError(f"{path}: {' and '.join(idle)} cannot be given; it takes {', '.join(raw.options)}")
     values, notes = _checked(raw.values, path), list(raw.notes)
@@ -177,14 +180,6 @@ def _read_own(path: Path, channel: Channel) -> Histograms:
         response=detector_response(scene.detector, scene.laser),
         scene=scene,
     )
-
-
-def _reading(path: Path, read: Callable[..., _Raw], *facts: Any) -> _Raw:
-    """What a reader reads from a path; whatever it raises becomes a `FileError`."""
-    if path.suffix.lower() not in ENDINGS:
-        raise FileError(f"{path}: ending {path.suffix!r} is not one of {', '.join(ENDINGS)}")
-    with reading(path):
-        return read(path, *facts)
 
 
 def _checked(values: NDArray[Any], path: Path) -> NDArray[Any]:
