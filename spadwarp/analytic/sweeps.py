@@ -116,10 +116,7 @@ def sweep(
         rows.append(_plan_row(changed, {**options, "largest_range": largest_range, "device": device}))
     curves = Sweep(fields=fields, values=tuple(values for values, *_ in chosen), rows=tuple(rows))
     if curves.is_flat:
-        hint = ""
-        if fields == ("detector.pulses_per_frame",):
-            hint = "; analytic.pulses_per_depth_frame or a count law per frame takes its place in this scene"
-        text = f"no number depends on {' and '.join(fields)}: the model does not use it{hint}"
+        text = f"no number depends on {' and '.join(fields)}: the model does not use it, or another field has its place"
         warnings.warn(text, SpadwarpWarning, stacklevel=2)
     return curves
 

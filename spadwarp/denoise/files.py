@@ -145,30 +145,14 @@ def read_depth(
 
 
 def _read_histograms(path: Path, measured: dict[str, Any], group_index: float | None) -> Histograms:
-    """Histograms of a file; an error for a fact that is missing names all that are."""
-    missing = {
-        "bin width is missing (bin_width)": measured.get("bin_width"),
-        "group index is missing (group_index): 1 in air, 1.3566 in fresh water, 1.3638 in seawater": group_index,
-    }
-    optional = "the instrument response is not given (irf): with it, counts are denoised with their histograms"
-    try:
-        histograms = read_histograms(path, **measured)
-    except ArgumentError as error:
-        if " is missing (" not in str(error):
-            raise
-        others = [text for text, value in missing.items() if value is None]
-        raise ArgumentError("; ".join([str(error), *others, *[optional] * ("irf" not in measured)])) from None
-    if group_index is not None:
-        if histograms.scene is not None:
-            raise ArgumentError(f"{path}: the file has its own group_index")
-        histograms = dataclasses.replace(histograms, group_index=group_index)
+    histograms = read_histograms(path, **measured)
+    notes = histograms.notes
     if histograms.scene is None and histograms.response is None:
-        known = dict(zip(missing, (histograms.bin_width, histograms.group_index), strict=True))
-        others = [text for text, value in known.items() if value is None]
-        if others:
-            raise ArgumentError("; ".join([*others, optional]))
-        return dataclasses.replace(histograms, notes=(*histograms.notes, optional))
-    return histograms
+        notes += ("the instrument response is not given (irf): with it, counts are denoised with their histograms",)
+    if group_index is not None and histograms.scene is not None:
+        raise ArgumentError(f"{path}: the file has its own group_index")
+    group_index = histograms.group_index if group_index is None else group_index
+    return dataclasses.replace(histograms, group_index=group_index, notes=notes)
 
 
 def _with_background(held: Histograms, given: ArrayLike | BackgroundLaw | None) -> Histograms:

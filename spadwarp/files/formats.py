@@ -400,7 +400,7 @@ def _write_result(result: Result, path: Path, ending: str, frames: Any) -> Path:
     if ending == ".npz":
         gate = result.scene.gate
         arrays = {"histogram": result.histogram, "true_depth": result.truth.depth}
-        return _save_npz(path, arrays, _axis_of(result.scene), gate.bins)
+        return _save_npz(path, arrays, _time_axis(gate.start, gate.bin_width, result.scene), gate.bins)
     if ending == ".png":
         return _save_png(path, result.depth())
     if ending == ".exr":
@@ -456,10 +456,6 @@ def _time_axis(start: float, width: float, scene: Scene | None) -> dict[str, flo
     """What turns a bin into a time of flight, and that into a length, by the names of our own files."""
     water = {} if scene is None else {"group_index": scene.medium.group_index}
     return {"gate_start": start, "bin_width": width, **water}
-
-
-def _axis_of(scene: Scene) -> dict[str, float]:
-    return _time_axis(scene.gate.start, scene.gate.bin_width, scene)
 
 
 def _save_npz(path: Path, arrays: Mapping[str, Any], axis: Mapping[str, float], bins: int) -> Path:
@@ -726,7 +722,7 @@ def write_lidar(result: Result, path: Path, *, seed: int = 0) -> list[Path]:
         import pyarrow
         import pyarrow.parquet
 
-        axis = _axis_of(result.scene)
+        axis = _time_axis(result.scene.gate.start, result.scene.gate.bin_width, result.scene)
         table = pyarrow.table(cloud.columns(), metadata={name: str(value) for name, value in axis.items()})
         return [write_file(path, partial(pyarrow.parquet.write_table, table))]
     return [_write_las(cloud, path, result.scene)]
@@ -739,7 +735,7 @@ def _las_header(point_format: int, points: Floats, scene: Scene) -> Any:
     header.scales, header.offsets = np.full(3, _COORDINATE), np.floor(points.min(axis=0))
     header.global_encoding.wkt = True
     header.generating_software = "spadwarp"
-    axis = json_text(_axis_of(scene)).encode()
+    axis = json_text(_time_axis(scene.gate.start, scene.gate.bin_width, scene)).encode()
     header.vlrs.append(laspy.VLR("LASF_Spec", 3, "time of flight, SI units", axis))  # 3: text
     return header
 

@@ -132,26 +132,21 @@ def test_evaluation_refuses_what_it_cannot_do(dataset, tmp_path):
             spadwarp.evaluation.evaluate(folder, **options)
 
 
-def validation_psnr(dataset, method, weights):
-    """Mean PSNR of the frames over target and level, by its definition; of the median with its best window."""
-    windows = {"median": range(3, 16, 2)}.get(method, [5])
-    groups = {}
+def validation_psnr(dataset, method, windows=(5,), **options):
+    """Mean over target and level of the PSNR of the frames, by its definition; with the best window at each."""
+    levels = {}
     for item in spadwarp.dataset.FrameReader(dataset, "validation", fields=("noisy", "clean", "bound", "prior")):
         noisy, clean, bound, prior = (item[name][0] for name in ("noisy", "clean", "bound", "prior"))
         start, stop = map(float, item["gate"])
         frames = depth_frames(noisy, gate=(start, stop), density=prior)
-        key = f"{item['target']} {item['backscatter_fraction']:.3f}"
         seen = np.isfinite(bound) & (clean >= start) & (clean < stop)
+        of_level = levels.setdefault((int(item["target"]), f"{item['backscatter_fraction']:.3f}"), {})
         for window in windows:
-            found = np.nan_to_num(noisy, nan=stop) if method == "input" else None
-            if method == "median":
-                found = baselines.median_filter(frames, window=window)[0]
-            if method == "usdn":
-                found = estimate_frames(frames, model="usdn", weights=weights, device="cpu").depth[0]
+            found = estimate_frames(frames, model=method, window=window, **options).depth[0]
             bits = [np.round(255 * np.clip((depth[seen] - start) / (stop - start), 0, 1)) for depth in (found, clean)]
             psnr = 20 * np.log10(255) - 10 * np.log10(np.mean(np.subtract(*bits) ** 2))
-            groups.setdefault(key, {}).setdefault(window, []).append(psnr)
-    return np.mean([max(map(np.mean, of_window.values())) for of_window in groups.values()])
+            of_level.setdefault(window, []).append(psnr)
+    return np.mean([max(map(np.mean, of_level.values())) for of_level in levels.values()])
 
 
 @pytest.mark.slow
@@ -160,8 +155,13 @@ def test_training_from_a_dataset(dataset, tmp_path):
     file.write_text(f'model = "usdn"\ndata = "{dataset}"\n[optimiser]\nsteps = 2\nbatch = 2\ncrop = 32\n')
     printed = run("train", file, "--out", out, "--device", "cpu", "--json", tmp_path / "printed.json").stdout
     numbers = json.loads((tmp_path / "printed.json").read_text())
-    for method, name in {"input": "input_psnr", "median": "median_psnr", "usdn": "psnr"}.items():
-        expected = validation_psnr(dataset, method, own)
+    windows = {"windows": baselines.MEDIAN_WINDOWS}
+    for name, *method in (
+        ("input_psnr", "input"),
+        ("median_psnr", "median", windows),
+        ("psnr", "usdn", {"weights": own}),
+    ):
+        expected = validation_psnr(dataset, method[0], **dict(*method[1:]))
         assert numbers[name] == pytest.approx(expected, abs=2e-3) and f"{expected:.4g} dB" in printed, name
     assert {path.name for path in out.iterdir()} >= {"usdn.safetensors", "log.jsonl", "curves.png"}
     assert network_files.weights_metadata("usdn", own)["seed"] == "0"
