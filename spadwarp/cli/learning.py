@@ -89,8 +89,8 @@ def train(recipe: Path, *, out: Path, overrides: list[str] | None = None, device
     if chosen.data is not None and chosen.model != "histograms":  # by the noise of the frames that the user has
         options: dict[str, Any] = {"models": ["median"], "split": "validation", "frames": 4, "weights": trained.weights}
         found = spadwarp.evaluation.evaluate(chosen.data, device=device, **options)
-        names = {"own": "psnr", "input": "input_psnr", "median": "median_psnr"}
-        shown |= {name: found.mean(method).psnr for method, name in names.items()}
+        methods = {"psnr": "own", "input_psnr": "input", "median_psnr": "median"}
+        shown |= {name: found.mean(method).psnr for name, method in methods.items()}
     if shown["psnr"] < shown["input_psnr"]:
         complain("the network makes frames worse than they are: more steps, or the recipe `short`, help", "warning")
     answer({**shown, "seconds": trained.seconds, "weights": trained.weights})

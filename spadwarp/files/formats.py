@@ -458,7 +458,7 @@ def _time_axis(start: float, width: float, scene: Scene | None) -> dict[str, flo
     return {"gate_start": start, "bin_width": width, **water}
 
 
-def _save_npz(path: Path, arrays: Mapping[str, Any], axis: Mapping[str, float], bins: int) -> Path:
+def _save_npz(path: Path, arrays: dict[str, Any], axis: dict[str, Any], bins: int) -> Path:
     time = axis["gate_start"] + (np.arange(bins) + 0.5) * axis["bin_width"]
     return write_file(path, partial(np.savez_compressed, **arrays, **axis, time=time))
 

@@ -439,8 +439,7 @@ def _read_ptu(path: Path, image_size: tuple[int, int] | None, sum_frames: bool) 
         comment = file.comment or "" if file.tags.get("CreatorSW_Name") == "spadwarp" else ""
         gate, water = (re.search(text, comment) for text in (r"Bin 0 begins at (\S+) ns", r"group index (\S+\d)"))
         facts = (1e-9 * float(gate[1]) if gate else None, float(water[1]) if water else None)
-        width = float(file.tcspc_resolution)
-        return _Raw(counts, tuple(notes), width, *facts, ordered=True, options=("image_size",))
+        return _Raw(counts, tuple(notes), float(file.tcspc_resolution), *facts, ordered=True, options=("image_size",))
 
 
 def _check_ptu(file: Any, path: Path) -> None:
