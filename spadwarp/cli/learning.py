@@ -159,7 +159,10 @@ def evaluate(
         opt.refuse("cannot be combined with --fresh, which makes scenes of its own", "DATA", "--models", "--report")
         run, show, write, options = evaluation.evaluate_fresh, _show_fresh, None, {"scenes": fresh, "seed": seed}
     elif data is not None and (data.is_file() or (data / "result.h5").is_file()):
-        run, show = partial(evaluation.photon_sweep, opt.load_run(data)), _show_photons
+        result = opt.load_run(data)
+        if problem := spadwarp.result.noise_problem(result):
+            complain(problem, "warning")  # it counts as light here
+        run, show = partial(evaluation.photon_sweep, result), _show_photons
         options["models"] = [name for name in chosen if name != "bm3d"] + ["histograms"] * (models == "all")
 
         def write(found: PhotonSweep, folder: Path) -> list[Path]:
