@@ -155,13 +155,9 @@ def test_training_from_a_dataset(dataset, tmp_path):
     file.write_text(f'model = "usdn"\ndata = "{dataset}"\n[optimiser]\nsteps = 2\nbatch = 2\ncrop = 32\n')
     printed = run("train", file, "--out", out, "--device", "cpu", "--json", tmp_path / "printed.json").stdout
     numbers = json.loads((tmp_path / "printed.json").read_text())
-    windows = {"windows": baselines.MEDIAN_WINDOWS}
-    for name, *method in (
-        ("input_psnr", "input"),
-        ("median_psnr", "median", windows),
-        ("psnr", "usdn", {"weights": own}),
-    ):
-        expected = validation_psnr(dataset, method[0], **dict(*method[1:]))
+    options = {"input": {}, "median": {"windows": baselines.MEDIAN_WINDOWS}, "usdn": {"weights": own}}
+    for name, method in {"input_psnr": "input", "median_psnr": "median", "psnr": "usdn"}.items():
+        expected = validation_psnr(dataset, method, **options[method])
         assert numbers[name] == pytest.approx(expected, abs=2e-3) and f"{expected:.4g} dB" in printed, name
     assert {path.name for path in out.iterdir()} >= {"usdn.safetensors", "log.jsonl", "curves.png"}
     assert network_files.weights_metadata("usdn", own)["seed"] == "0"

@@ -122,16 +122,6 @@ def test_reference_is_that_of_the_code():
     assert "| `warm_up` | integer | [0, 1000000000000] | `500` | updates in which" in made["training.md"]
 
 
-def test_pages_of_the_site_exist():
-    """What the navigation names leads to a file."""
-    text = (ROOT / "mkdocs.yml").read_text()
-    named = set(re.findall(r": ([\w/]+\.md)$", text, re.MULTILINE))
-    elsewhere = set(re.findall(r'": "([\w/]+\.md)"', (ROOT / "docs" / "hooks.py").read_text()))
-    here = {str(path.relative_to(ROOT / "docs")) for path in (ROOT / "docs").rglob("*.md")}
-    here |= {f"notebooks/{path.stem}.md" for path in (ROOT / "docs" / "notebooks").glob("*.ipynb")}
-    assert named and named <= here | elsewhere
-
-
 def test_every_image_is_shown_somewhere():
     shown = "".join(map(text_of, [*PAGES, README]))
     unused = [path.name for path in (ROOT / "docs" / "images").glob("*.png") if path.name not in shown]
