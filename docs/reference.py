@@ -1,8 +1,8 @@
 """Writes the pages in docs/reference that come from the code: `python docs/reference.py`.
 
-scene.md and recipe.md: every field of a scene and of a dataset recipe, from their models. dataset.md: what the files
-of a dataset hold. cli.md: the help of every command. python.md and kernels.md: the public names, whose docstrings
-mkdocstrings shows.
+scene.md, recipe.md and training.md: every field of a scene, a dataset recipe and a training recipe, from their
+models. dataset.md: what the files of a dataset hold. cli.md: the help of every command. python.md and kernels.md: the
+public names, whose docstrings mkdocstrings shows.
 """
 
 from __future__ import annotations
@@ -26,6 +26,7 @@ from pydantic_core import PydanticUndefined
 import spadwarp
 from spadwarp.cli import app
 from spadwarp.dataset import Distribution, Recipe
+from spadwarp.denoise.recipe import TrainingRecipe
 from spadwarp.scene import Scene
 from spadwarp.scene.grid import COEFFICIENTS
 from spadwarp.scene.sections import interval_of, parts_of
@@ -40,6 +41,7 @@ def pages() -> dict[str, str]:
     return {
         "scene.md": scene(),
         "recipe.md": recipe(),
+        "training.md": training(),
         "dataset.md": dataset(),
         "cli.md": commands(),
         "python.md": python(),
@@ -63,7 +65,7 @@ def scene() -> str:
         "```toml\n" + _EXAMPLE + "```\n"
     ]
     for name, field in Scene.model_fields.items():
-        parts.append(_section(name, _model(field), repeated=name in ("targets", "flux")))
+        parts.append(_section(name, _model(field), repeated=_is_repeated(field)))
     return "\n".join(parts)
 
 
@@ -94,18 +96,41 @@ translation = [0.0, 0.0, 5.0]
 
 def recipe() -> str:
     """Tables and fields of a dataset recipe."""
-    top = {name: field for name, field in Recipe.model_fields.items() if _model(field) in (None, Distribution)}
-    parts = [
-        MADE + "# Dataset recipe\n\n"
-        "What `spadwarp dataset RECIPE` draws from. A *distribution* is a number (always that), a list (one of "
-        "these) or a table `{low = …, high = …}`, with `log = true` even in the logarithm. Recipes that run as they "
-        "are: [configs/datasets](../../configs/datasets).\n",
-        "## Top level\n\n" + _table(top),
-    ]
-    for name, field in Recipe.model_fields.items():
-        model = _model(field)
-        if model is not None and name not in top:
-            parts.append(_section(name, model))
+    return (
+        MADE
+        + (
+            "# Dataset recipe\n\n"
+            "What `spadwarp dataset RECIPE` draws from. A *distribution* is a number (always that), a list (one of "
+            "these) or a table `{low = …, high = …}`, with `log = true` even in the logarithm. Recipes that run as "
+            "they are: [configs/datasets](../../configs/datasets).\n\n"
+        )
+        + _document(Recipe)
+    )
+
+
+def training() -> str:
+    """Tables and fields of a training recipe."""
+    return (
+        MADE
+        + (
+            "# Training recipe\n\n"
+            "What `spadwarp train RECIPE` learns from ([how](../denoising.md#training)). Recipes that run as they are: "
+            "[configs/training](../../configs/training). `--set optimiser.steps=2000` overrides a field.\n\n"
+        )
+        + _document(TrainingRecipe)
+    )
+
+
+def _document(document: type[BaseModel]) -> str:
+    """The fields at the top level, then each table."""
+    fields = document.model_fields
+    top = {name: field for name, field in fields.items() if _model(field) in (None, Distribution)}
+    parts = ["## Top level\n\n" + _table(top)]
+    models = {name: model for name, field in fields.items() if name not in top and (model := _model(field))}
+    for name, model in models.items():
+        base = model.__base__ if model.__base__ in models.values() else None  # has a table of its own
+        elsewhere = () if base is None else base.model_fields
+        parts.append(_section(name, model, repeated=_is_repeated(fields[name]), elsewhere=elsewhere))
     return "\n".join(parts)
 
 
@@ -124,11 +149,11 @@ def _table(fields: Mapping[str, FieldInfo]) -> str:
     return "\n".join(lines) + "\n"
 
 
-def _section(name: str, model: type[BaseModel], *, repeated: bool = False) -> str:
+def _section(name: str, model: type[BaseModel], *, repeated: bool = False, elsewhere: Iterable[str] = ()) -> str:
     lines = [f"## {name}", "", inspect.cleandoc(model.__doc__ or ""), ""]
     if repeated:
         lines += [f"Written as `[[{name}]]`, once for each.", ""]
-    lines.append(_table(model.model_fields))
+    lines.append(_table({field: info for field, info in model.model_fields.items() if field not in elsewhere}))
     presets = [one for one in spadwarp.scene.presets().values() if one.section == name.rpartition(".")[2]]
     if presets:
         lines += ['Presets (`preset = "…"`), with their sources:']
@@ -142,8 +167,12 @@ def _section(name: str, model: type[BaseModel], *, repeated: bool = False) -> st
     for field, info in model.model_fields.items():
         inner = _model(info)
         if inner is not None and inner is not Distribution:
-            lines += ["", _section(f"{name}.{field}", inner, repeated=get_origin(info.annotation) is tuple)]
+            lines += ["", _section(f"{name}.{field}", inner, repeated=_is_repeated(info))]
     return "\n".join(lines) + "\n"
+
+
+def _is_repeated(field: FieldInfo) -> bool:
+    return get_origin(field.annotation) is tuple
 
 
 def _flat(annotation: Any) -> Iterator[Any]:

@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 from spadwarp.analytic.budgets import LONGEST, BudgetRow, central_row
 from spadwarp.analytic.planning import plan
 from spadwarp.io.text import parse_toml
+from spadwarp.result import POLARISED
 from spadwarp.scene import Scene, SceneLike, as_scene, parse_override
 from spadwarp.scene.sections import field_unit, locate, parse_key, takes_integers
 from spadwarp.values import (
@@ -115,10 +116,7 @@ def sweep(
         rows.append(_plan_row(changed, {**options, "largest_range": largest_range, "device": device}))
     curves = Sweep(fields=fields, values=tuple(values for values, *_ in chosen), rows=tuple(rows))
     if curves.is_flat:
-        hint = ""
-        if fields == ("detector.pulses_per_frame",):
-            hint = "; analytic.pulses_per_depth_frame or a count law per frame takes its place in this scene"
-        text = f"no number depends on {' and '.join(fields)}: the model does not use it{hint}"
+        text = f"no number depends on {' and '.join(fields)}: the model does not use it, or another field has its place"
         warnings.warn(text, SpadwarpWarning, stacklevel=2)
     return curves
 
@@ -159,7 +157,7 @@ def combinations(scene: SceneLike, vary: Any, *, planned: bool) -> tuple[tuple[s
     check_integer("number of values to vary", math.prod(len(values) for _, values in curves), f"[1, {LONGEST}]")
     fields = tuple(field for field, _ in curves)
     if not planned and (own := [field for field in fields if field in ("range", _ANALYSER)]):
-        text = "goes with no other field in a budget: vary it alone, or plan each combination, of = 'plan'"
+        text = "is no field of a budget: of = 'plan' varies it with others; `spadwarp.budget` is over range alone"
         raise ArgumentError(f"vary: {own[0]} {text}")
     waves = dict(curves).get("laser.wavelength_nm", ())
     follows = scene.medium.chlorophyll is not None or any(field.startswith("medium.") for field in fields)
@@ -176,6 +174,7 @@ def combinations(scene: SceneLike, vary: Any, *, planned: bool) -> tuple[tuple[s
             if field == "range":
                 arguments["ranges"] = (value, value)
             elif field == _ANALYSER:
+                check_choice(f"vary: {_ANALYSER}", value, ("none", *POLARISED))
                 arguments["channel"] = "I" if value == "none" else value
                 if value != "none" and not scene.camera.channels:
                     overrides["camera.polarisation"] = "analyser"
@@ -184,7 +183,7 @@ def combinations(scene: SceneLike, vary: Any, *, planned: bool) -> tuple[tuple[s
             else:
                 overrides[field] = value
         changed = scene.with_overrides(overrides)
-        if "channel" in arguments and changed.laser.polarisation == "none":
+        if arguments.get("channel", "I") != "I" and changed.laser.polarisation == "none":
             text = "is for polarised lasers: laser.polarisation = 'linear'"
             raise ConfigError(f"{_ANALYSER} = {arguments['channel']!r} {text}", source=scene.source)
         chosen.append((values, changed, arguments))

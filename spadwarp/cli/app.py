@@ -32,6 +32,7 @@ class Running:
     """The command that runs: its common options, and the names of all that have another value than by default."""
 
     quiet: bool = False
+    prints_result: bool = False  # also with --quiet
     overwrite: bool = False
     json: Path | None = None
     given: frozenset[str] = frozenset()
@@ -133,8 +134,8 @@ def until_the_end(context: AbstractContextManager[Value]) -> Value:
 
 
 def say(text: str = "") -> None:
-    """Prints the answer of a command to stdout, but with --quiet."""
-    if not running.quiet:
+    """Prints the answer of a command to stdout; with --quiet only where no file holds it."""
+    if not running.quiet or running.prints_result:
         typer.echo(text)
 
 

@@ -171,8 +171,8 @@ def depth(
     field of view, the output is the range along the line of sight, for a laser in the lens.
 
     Args:
-        path (FILE): A result or frames (.h5, or their directory), or measured: .npy, .mat, .h5, .ptu. Of an analytic
-            file, a dataset or a shard its depth frames are written as they are.
+        path (FILE): A result or frames (.h5, or their directory), or measured: .npy, .npz, .mat, .h5, .ptu. Of an
+            analytic file, a dataset or a shard its depth frames are written as they are.
         method: Estimator of the arrival time.
         min_significance (S): Of counts, pixels whose significance is below S have no depth: background alone gives more
             with a probability of 10^-S. 0: every pixel has one. By default detector.min_significance of a simulation, 4
@@ -243,7 +243,7 @@ _Start = Annotated[dict[str, float], opt.numbers("NAME=VALUE")]
 _Prior = Annotated[dict[str, tuple[float, float]], opt.numbers("NAME=MEAN,SD")]
 
 
-@command()
+@command(prints_result=True)
 def fit(
     path: Path,
     scene: Path | None = None,
@@ -271,8 +271,8 @@ def fit(
     values of the pixels, the table shows the median of the pixels that see a target.
 
     Args:
-        path (COUNTS): Frames (.h5, or their directory), or measured histograms: .npy, .mat, .h5, .ptu; none with
-            --bounds.
+        path (COUNTS): Frames (.h5, or their directory), or measured histograms: .npy, .npz, .mat, .h5, .ptu;
+            none with --bounds.
         scene (SCENE): Scene file (TOML), or the name of a scene of `spadwarp list scenes`.
         unknown (NAMES): Names of the unknowns, with commas between: absorption, scattering, anisotropy, reflectance (or
             targets[0].reflectance), background, depth. ':pixel' behind one of the last three gives each pixel its own.
@@ -401,12 +401,12 @@ def denoise(
     does not keep their background. Needs pip install "spadwarp[denoise]".
 
     --input also takes channel=NAME (of an EXR; of a result co or cross), scale=0.01 (metres per unit) and as_depth
-    (three dimensions in .npy, .mat and .h5 are frames of depth, not a histogram).
+    (three dimensions in .npy, .npz, .mat and .h5 are frames of depth, not a histogram).
 
     Args:
         path (IN): A result or frames (.h5, or their directory); an analytic file, a dataset or a shard, of which the
-            stored depth counts; depth (.exr, .npy, .mat, .h5), measured histograms (.npy, .mat, .h5, .ptu), or a folder
-            of them.
+            stored depth counts; depth (.exr, .npy, .npz, .mat, .h5), measured histograms (the same endings, .ptu), or a
+            folder of them.
         model: pyramid, histograms, dncnn, usdn; or median, gating, bm3d; for counts also likelihood, pooled,
             semi-global, total-variation, belief-propagation.
         gate (FROM:TO): Gate in depth, such as 13.5:16 [m]; also in time, such as 90ns:110ns, with --input group_index.

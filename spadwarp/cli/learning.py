@@ -68,7 +68,8 @@ def train(recipe: Path, *, out: Path, overrides: list[str] | None = None, device
 
     New noise is drawn for each step. Writes weights (safetensors), log.jsonl, curves.png and a checkpoint, also at
     Ctrl-C or SIGTERM; the same command resumes the training. Another recipe needs a new folder. Prints the PSNR [dB] of
-    the network and of its input: on noisy frames of the dataset's validation split, else on drawn scenes.
+    the network and of its input, on drawn scenes; or on noisy frames of the dataset's validation split, where that of
+    the best median filter stands beside them.
 
     Args:
         recipe (RECIPE): Training recipe (TOML), or the name of one of `spadwarp list training`.
@@ -84,21 +85,22 @@ def train(recipe: Path, *, out: Path, overrides: list[str] | None = None, device
     names = (f"{chosen.model}.safetensors", "log.jsonl", "curves.png", "checkpoint.pt")
     check_outputs(out, names, inputs=(recipe,), resume=True)
     trained = spadwarp.denoise.train(chosen, out, device=device, progress=progress("steps"), notify=note)
-    shown = {name: getattr(trained, name) for name in ("psnr", "input_psnr", "seconds", "weights")}
+    shown: dict[str, Any] = {"psnr": trained.psnr, "input_psnr": trained.input_psnr}
     if chosen.data is not None and chosen.model != "histograms":  # by the noise of the frames that the user has
-        options: dict[str, Any] = {"models": (), "split": "validation", "frames": 4, "weights": trained.weights}
+        options: dict[str, Any] = {"models": ["median"], "split": "validation", "frames": 4, "weights": trained.weights}
         found = spadwarp.evaluation.evaluate(chosen.data, device=device, **options)
-        shown |= {"psnr": found.mean("own").psnr, "input_psnr": found.mean("input").psnr}
+        methods = {"psnr": "own", "input_psnr": "input", "median_psnr": "median"}
+        shown |= {name: found.mean(method).psnr for name, method in methods.items()}
     if shown["psnr"] < shown["input_psnr"]:
         complain("the network makes frames worse than they are: more steps, or the recipe `short`, help", "warning")
-    answer(shown)
+    answer({**shown, "seconds": trained.seconds, "weights": trained.weights})
 
 
 _PICTURES = ("metrics", "samples", "rescaled", "detail", "ranking", "photons", "reliability")
 _REPORT = ("report.html", "scores.json", *(f"{name}.png" for name in _PICTURES))
 
 
-@command()
+@command(prints_result=True)
 def evaluate(
     data: Path | None = None,
     *,
@@ -157,7 +159,10 @@ def evaluate(
         opt.refuse("cannot be combined with --fresh, which makes scenes of its own", "DATA", "--models", "--report")
         run, show, write, options = evaluation.evaluate_fresh, _show_fresh, None, {"scenes": fresh, "seed": seed}
     elif data is not None and (data.is_file() or (data / "result.h5").is_file()):
-        run, show = partial(evaluation.photon_sweep, opt.load_run(data)), _show_photons
+        result = opt.load_run(data)
+        if problem := spadwarp.result.noise_problem(result):
+            complain(problem, "warning")  # it counts as light here
+        run, show = partial(evaluation.photon_sweep, result), _show_photons
         options["models"] = [name for name in chosen if name != "bm3d"] + ["histograms"] * (models == "all")
 
         def write(found: PhotonSweep, folder: Path) -> list[Path]:

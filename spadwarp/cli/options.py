@@ -33,13 +33,12 @@ SHARED = tomllib.loads((files("spadwarp.cli") / "options.toml").read_text(encodi
 _COMMON = {"overwrite": bool, "quiet": bool, "json": Path | None}
 
 
-def command(*, without: tuple[str, ...] = (), name: str | None = None) -> Callable[[Callable[..., None]], Any]:
+def command(*, name: str | None = None, prints_result: bool = False) -> Callable[[Callable[..., None]], Any]:
     """Makes a command of a function: its parameters become arguments, those behind `*` options.
 
     Kinds and defaults come from the signature; an annotated function reads the text. Metavar and help are those of the
     docstring's section `Args`, `parameter (METAVAR): help`, else of `SHARED`. A trailing "_" is no part of an option's
-    name. Each command has --overwrite, --quiet and --json, which `running` holds, but those that are named in
-    `without`.
+    name. Each command has --overwrite, --quiet and --json, which `running` holds; `prints_result`: also with --quiet.
     """
 
     def register(function: Callable[..., None]) -> Callable[..., None]:
@@ -49,7 +48,6 @@ def command(*, without: tuple[str, ...] = (), name: str | None = None) -> Callab
         common = [
             inspect.Parameter(one, inspect.Parameter.KEYWORD_ONLY, default=False if kind is bool else None)
             for one, kind in _COMMON.items()
-            if one not in without
         ]
         for one in (*inspect.signature(function).parameters.values(), *common):
             shared = SHARED.get(one.name, {})
@@ -62,6 +60,7 @@ def command(*, without: tuple[str, ...] = (), name: str | None = None) -> Callab
         def run(**values: Any) -> None:
             for common in _COMMON:
                 setattr(running, common, values.pop(common, None))
+            running.prints_result = prints_result
             running.given = frozenset(names[one] for one, value in values.items() if value != defaults[one])
             function(**{one: _plain(value) for one, value in values.items()})
 

@@ -67,7 +67,7 @@ def _warnings(scene: Scene, but: str = "") -> list[str]:
 _Range = Annotated[tuple[float, float], opt.from_to("m")]
 
 
-@command()
+@command(prints_result=True)
 def plan(
     scene: Path,
     *,
@@ -307,11 +307,6 @@ def sweep(
             f"* not the scene's gate, {read.gate.start_ns:.4g}-{read.gate.stop * 1e9:.4g} ns, which misses the return "
             "of one of the ranges, but one as long around the return"
         )
-    own, detector = read.analytic.pulses_per_depth_frame, read.detector.pulses_per_frame
-    if of == "budget" and read.analytic.count_law == "per_pulse" and own not in (None, detector):
-        say(
-            f"pulses: analytic.pulses_per_depth_frame = {own}; without it, detector.pulses_per_frame = {detector} count"
-        )
     written(files)
     write_json({**summary, "rows": plain, "notes": spadwarp.analytic.model_notes(read), "files": files})
 
@@ -371,7 +366,7 @@ _Particles = Annotated[dict[str, float], opt.items(_PARTICLES)]
 _OPTICS = ("absorption", "scattering", "extinction", "albedo", "mean_cosine", "backscatter_fraction")
 
 
-@command(without=("quiet",))
+@command(prints_result=True)
 def water(
     wavelength_nm: Annotated[float, opt.from_unit("nm")],
     *,

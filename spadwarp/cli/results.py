@@ -16,7 +16,7 @@ from spadwarp.cli.options import command
 from spadwarp.cli.outputs import answer, check_outputs, in_bytes, progress, readable, rows, write_json
 
 
-@command(without=("quiet",))
+@command(prints_result=True)
 def info(path: Path, *, verify: bool = False) -> None:
     """Contents of any of our files; of a result also how it was made; of a mesh file size, unit, orientation, holes.
 
@@ -82,7 +82,7 @@ _DRAWN = {
 _Window = Annotated[tuple[float, float], opt.from_to("ns")]
 
 
-@command(without=("json",))
+@command()
 def view(
     path: Path,
     *,
@@ -153,6 +153,7 @@ def view(
     else:
         written = spadwarp.viz.view(path, target, method=method, frame=frame or 0, channel=channel, device=device)
     say(f"written: {written} ({in_bytes(written.stat().st_size)})")
+    write_json({"file": written})
 
 
 def _frames(text: str) -> int | slice:
@@ -193,7 +194,7 @@ def export(
 
     \b
     npy     NumPy: [height, width, bin], with frames before that; depth where there are no counts
-    npz     the same with its axis time [s], bin_width, gate_start and true_depth [m]
+    npz     the same with its axis time [s], bin_width, gate_start, group_index and true_depth [m]
     png     depth in millimetres, 16 bits, as OpenCV and ROS read it; one file a frame
     mat     MATLAB, one file a frame, as single-photon denoisers read: sparse spad, rates, bin from 1, bin_size [s]
     ptu     PicoQuant T3 image, one record a detection

@@ -15,7 +15,7 @@ from spadwarp.cli.outputs import check_outputs, rows, write_json
 from spadwarp.values import count, suggestion
 
 
-@command(without=("json",))
+@command()
 def init(
     name: str | None = None,
     *,
@@ -51,6 +51,7 @@ def init(
         place = path if path.is_absolute() or path.parent.parts else f"./{path}"
         say(f"written: {path}\nVS Code, once:\n  code --install-extension tamasfe.even-better-toml")
         say(f"first line of a TOML file beside it, for VS Code and taplo:\n  #:schema {place}")
+        write_json({"file": path})
         return
     name = "scene" if name is None else name
     path = Path(name if name.lower().endswith(".toml") else f"{name}.toml")
@@ -64,9 +65,10 @@ def init(
         text = spadwarp.io.read_text(copied)
     spadwarp.io.write_text(text, path)
     say(f"written: {path}\nnext: spadwarp check {path}; spadwarp plan {path}; spadwarp simulate {path} --out {out}")
+    write_json({"file": path})
 
 
-@command(without=("quiet",), name="list")
+@command(name="list", prints_result=True)
 def listed(
     kind: Literal["scenes", "datasets", "training", "presets", "targets", "validation", "benchmarks"] | None = None,
     name: str | None = None,

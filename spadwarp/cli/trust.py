@@ -22,7 +22,7 @@ def _announce(case: Any) -> None:
     note(f"{case.name}: {case.summary}")
 
 
-@command()
+@command(prints_result=True)
 def validate(
     cases: list[str] | None = None,
     *,
@@ -72,7 +72,7 @@ def validate(
         fail("\n".join(f"{one.name}: {one.quantity}: z = {one.z:.2f}" for one in failed))
 
 
-@command()
+@command(prints_result=True)
 def bench(
     cases: list[str] | None = None,
     *,

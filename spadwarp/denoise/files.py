@@ -93,7 +93,7 @@ def read_depth(
         background: Of counts whose response is known, as `spadwarp.denoise.estimate` takes it, replacing the file's;
             default: the file's, else "decay".
         gate: (start, stop) in depth [m]; of counts whose response is known, only the bins within it are used.
-        group_index: Of measured histograms, see `depth_of`.
+        group_index: Of measured histograms, see `depth_of`; default: that of the file.
         device: Warp device of the estimator.
         measured: What a file of measured histograms does not say, as `read_histograms` takes it.
 
@@ -140,31 +140,19 @@ def read_depth(
     elif background is not None:
         raise ArgumentError(f"{place}: background is of counts whose instrument response (irf) is known")
     if counted and gate is not None:
-        histograms = _within(histograms, gate, float(group_index or 1.0))
-    return dataclasses.replace(_estimate_depth(histograms, counted, method, group_index, device), truth=truth)
+        histograms = _within(histograms, gate)
+    return dataclasses.replace(_estimate_depth(histograms, counted, method, device), truth=truth)
 
 
 def _read_histograms(path: Path, measured: dict[str, Any], group_index: float | None) -> Histograms:
-    """Histograms of a file; an error for a fact that is missing names all that are."""
-    missing = {
-        "bin width is missing (bin_width)": measured.get("bin_width"),
-        "group index is missing (group_index): 1 in air, 1.3566 in fresh water, 1.3638 in seawater": group_index,
-    }
-    optional = "the instrument response is not given (irf): with it, counts are denoised with their histograms"
-    try:
-        histograms = read_histograms(path, **measured)
-    except ArgumentError as error:
-        if " is missing (" not in str(error):
-            raise
-        others = [text for text, value in missing.items() if value is None]
-        raise ArgumentError("; ".join([str(error), *others, *[optional] * ("irf" not in measured)])) from None
+    histograms = read_histograms(path, **measured)
+    notes = histograms.notes
     if histograms.scene is None and histograms.response is None:
-        known = dict(zip(missing, (histograms.bin_width, group_index), strict=True))
-        others = [text for text, value in known.items() if value is None]
-        if others:
-            raise ArgumentError("; ".join([*others, optional]))
-        return dataclasses.replace(histograms, notes=(*histograms.notes, optional))
-    return histograms
+        notes += ("the instrument response is not given (irf): with it, counts are denoised with their histograms",)
+    if group_index is not None and histograms.scene is not None:
+        raise ArgumentError(f"{path}: the file has its own group_index")
+    group_index = histograms.group_index if group_index is None else group_index
+    return dataclasses.replace(histograms, group_index=group_index, notes=notes)
 
 
 def _with_background(held: Histograms, given: ArrayLike | BackgroundLaw | None) -> Histograms:
@@ -218,15 +206,13 @@ def _stored_depth(
     return stored_images(path, dataset, several=as_depth)
 
 
-def _estimate_depth(
-    histograms: Histograms, counted: bool, method: Method | None, group_index: float | None, device: str | None
-) -> DepthReading:
+def _estimate_depth(histograms: Histograms, counted: bool, method: Method | None, device: str | None) -> DepthReading:
     method = method or ("likelihood" if counted else "matched")
     if method in ("matched", "likelihood") and histograms.response is None:
         method = "centroid"
-    reduced = depth_of(histograms, method=method, group_index=group_index, min_significance=0.0, device=device)
+    reduced = depth_of(histograms, method=method, min_significance=0.0, device=device)
     scene = histograms.scene
-    index = scene.medium.group_index if scene is not None else float(group_index or 1.0)
+    index = scene.medium.group_index if scene is not None else float(histograms.group_index or 1.0)
     gate_stop = histograms.gate_start + histograms.values.shape[-1] * float(histograms.bin_width or 0.0)
     depth = reduced.values.astype(np.float32)
     depth[depth <= 0.0] = np.nan  # a peak of noise at the time of the pulse
@@ -242,18 +228,18 @@ def _estimate_depth(
     )
 
 
-def depth_at(time: NDArray[np.float64], histograms: Histograms, group_index: float) -> NDArray[np.float64]:
+def depth_at(time: NDArray[np.float64], histograms: Histograms) -> NDArray[np.float64]:
     """Depth [m] at times of flight `[..., H, W]` [s]; range where the camera is not known."""
     if histograms.scene is None:
-        return range_from_time(time, group_index)
+        return range_from_time(time, float(histograms.group_index or 1.0))
     return depth_from_time(time, scene=histograms.scene)
 
 
-def _within(held: Histograms, gate: tuple[float, float], group_index: float) -> Histograms:
+def _within(held: Histograms, gate: tuple[float, float]) -> Histograms:
     """Those bins alone whose depth lies in a gate [m] in some pixel."""
     bins, width = held.values.shape[-1], float(held.bin_width or 0.0)
     times = [np.full(held.values.shape[-3:-1], held.gate_start + width * edge) for edge in (0, bins)]
-    near, far = (depth_at(time, held, group_index) for time in times)
+    near, far = (depth_at(time, held) for time in times)
     first = max(0, int(np.floor(np.min((gate[0] - near) / (far - near)) * bins + 1e-6)))
     stop = min(bins, int(np.ceil(np.max((gate[1] - near) / (far - near)) * bins - 1e-6)))
     if stop <= first:
@@ -363,8 +349,7 @@ def denoise_file(
         if counts is not None and counting:
             model = "histograms" if model == "pyramid" else model
             notes.append("denoised with its histograms")
-            index = float(reading.get("group_index") or 1.0)
-            found, second = _from_counts(read, counts, profile, model, weights, index, device)
+            found, second = _from_counts(read, counts, profile, model, weights, device)
         else:
             second = None
             profile = read.profile if profile is None else profile
@@ -437,7 +422,6 @@ def _from_counts(
     profile: NDArray[np.float64] | None,
     model: str,
     weights: str | Path | None,
-    group_index: float,
     device: str | None,
 ) -> tuple[Estimate, NDArray[np.float32]]:
     """The estimate of a method that uses counts, in the bins that hold the target; and second returns [m]."""
@@ -452,7 +436,7 @@ def _from_counts(
 
     def to_depth(place: NDArray[np.float32]) -> NDArray[np.float64]:
         time = start + place.astype(np.float64) * (some.shape[-1] * width)
-        return depth_at(time, histograms, group_index)
+        return depth_at(time, histograms)
 
     found = estimate_histograms(
         read.depth, counts, known, response, bins=slice(first, stop), gate=part, model=model, to_depth=to_depth,

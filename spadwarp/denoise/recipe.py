@@ -11,7 +11,7 @@ from pydantic import AfterValidator, BeforeValidator, Field
 
 from spadwarp.io.paths import example_or_path
 from spadwarp.io.text import read_toml
-from spadwarp.scene.sections import Document, Section, Whole
+from spadwarp.scene.sections import Document, Section, Whole, listed
 
 __all__ = ["TrainingRecipe", "load_training_recipe"]
 
@@ -29,17 +29,10 @@ def _ordered(limits: tuple[float, float]) -> tuple[float, float]:
     return limits
 
 
-def _pair(value: Any) -> Any:
-    is_pair = isinstance(value, list) and all(
-        isinstance(one, int | float) and not isinstance(one, bool) for one in value
-    )
-    return tuple(map(float, value)) if is_pair else value
-
-
 Share = Annotated[float, Field(ge=0, le=1)]
 Spread = Annotated[float, Field(ge=0, le=100)]
 Above0 = Annotated[float, Field(ge=1e-9, le=1e9)]
-_CHECKS = BeforeValidator(_pair), AfterValidator(_ordered)
+_CHECKS = BeforeValidator(listed), AfterValidator(_ordered)
 Limits = Annotated[tuple[Spread, Spread], *_CHECKS]
 Positive = Annotated[tuple[Above0, Above0], *_CHECKS]
 Shares = Annotated[tuple[Share, Share], *_CHECKS]
@@ -57,22 +50,22 @@ class Noise(Section):
     decay: Positive = Field(
         (0.3, 40.0), description="rate at which backscatter falls over the gate [1/gate], uniform in the logarithm"
     )
-    own_gate: Share = Field(0.5, description="samples with the scene's own gate")
+    own_gate: Share = Field(0.5, description="samples with the scene's own gate; the others have one of gate_width")
     own_profile: Share = Field(0.7, description="of these, samples with the scene's own backscatter profile")
     gate_width: Positive = Field((1.0, 8.0), description="width of other gates [m], uniform in the logarithm")
     wide_gate: Share = Field(0.5, description="samples whose camera's gate is wider than what the network is given")
     behind: Share = Field(0.55, description="samples with backscatter from behind the target too: multiple scattering")
     slanted_gate: Share = Field(0.5, description="samples whose gate opens up to 15 % of its width nearer in depth")
     counting: Share = Field(0.2, description="samples whose depth was estimated from histograms of few photons")
-    photons: Positive = Field((0.7, 150.0), description="signal counts per pixel of these, uniform in the logarithm")
-    sbr: Positive = Field((0.03, 8.0), description="signal counts over background counts, uniform in the logarithm")
+    photons: Positive = Field((0.7, 150.0), description="of these, signal counts per pixel, uniform in the logarithm")
+    sbr: Positive = Field((0.03, 8.0), description="of these, signal over background counts, uniform in the logarithm")
     scattered: Share = Field(0.0, description="of these, samples with forward-scattered light, delayed and spread")
     delay: Positive = Field(
         (0.004, 0.12), description="mean delay of that light [gate widths], uniform in the logarithm"
     )
     spread: Positive = Field((0.5, 20.0), description="its spread over the image [pixels], uniform in the logarithm")
     halo: Share = Field(0.0, description="of these, samples in which at most 70 % of the light is scattered: a halo")
-    roughness: Limits = Field((0.0, 0.0), description="deviation of the logarithm of its rate from bin to bin")
+    roughness: Limits = Field((0.0, 0.0), description="standard deviation of that light's logarithm from bin to bin")
     ambient: Share = Field(0.0, description="of these, samples with ambient light, which follows the reflectance")
     two_returns: Share = Field(0.4, description="of these, samples in which pixels see a weaker second surface")
     wrong: Share = Field(
@@ -89,7 +82,7 @@ class Noise(Section):
 
 
 class Part(Noise):
-    """A part of the samples, with noise of its own: `[noise]`, except for what is given here."""
+    """A part of the samples with noise of its own: these fields and those of `[noise]`, by default as there."""
 
     share: float = Field(..., gt=0, le=1, description="part of the samples; all shares together are 1")
     crowded: Share = Field(0.0, description="of these, samples whose scene is two scenes, one before the other")
@@ -105,15 +98,15 @@ class Optimiser(Section):
     """How the network is trained."""
 
     steps: Whole = Field(40_000, ge=1, le=10**12, description="updates of the weights")
-    batch: Whole = Field(64, ge=1, le=10**6, description="crops per update, on all GPUs together")
+    batch: Whole = Field(64, ge=1, le=10**6, description="crops per update")
     crop: Whole = Field(96, ge=LEAST_CROP, le=16384, description="side of a crop [pixels]")
     wide: Share = Field(0.0, description="part of the updates with a quarter as many crops of twice the side")
     scenes: Whole = Field(512, ge=1, le=10**6, description="scenes that are drawn at a time; without a dataset")
     redraw: Whole = Field(200, ge=1, le=10**12, description="updates between two drawings of scenes")
-    learning_rate: float = Field(1e-3, ge=1e-12, le=1e3, description="highest; decreases along a cosine to a hundredth")
+    learning_rate: float = Field(1e-3, ge=1e-12, le=1e3, description="highest; falls along a cosine to a hundredth")
     warm_up: Whole = Field(500, ge=0, le=10**12, description="updates in which the learning rate rises")
-    weight_decay: float = Field(1e-4, ge=0, le=1e3)
-    averaging: float = Field(0.999, ge=0, lt=1, description="decay of the running mean of the weights that is kept")
+    weight_decay: float = Field(1e-4, ge=0, le=1e3, description="that of the optimiser AdamW")
+    averaging: float = Field(0.999, ge=0, lt=1, description="decay of the running mean of the weights, which is saved")
     report_every: Whole | None = Field(
         None, ge=1, le=10**12, description="updates between two lines of the log; default: steps / 20, at most 500"
     )
@@ -129,7 +122,7 @@ class TrainingRecipe(Document):
 
     model: Literal["pyramid", "histograms", "dncnn", "usdn"] = Field(..., description="network")
     start: Literal["pyramid", "histograms"] | None = Field(
-        None, description="network of the package whose weights the training starts from: the model itself"
+        None, description="the same name as model: the training starts from the weights of the package"
     )
     data: Annotated[str, Field(min_length=1)] | None = Field(
         None, description="dataset (folder), relative to the working directory; without it, scenes are drawn"

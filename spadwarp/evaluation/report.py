@@ -66,8 +66,7 @@ def write_scene_report(scores: SceneScores, folder: str | Path) -> list[Path]:
 
     A table for each scene type, and how often the probabilities were true. Raises `FileError`.
     """
-    note = "scenes of spadwarp.evaluation.drawn_scenes"
-    picture = draw_reliability(scores.reliability, Path(folder) / "reliability.png", note=note)
+    picture = draw_reliability(scores.reliability, Path(folder) / "reliability.png")
     tables: list[_Table] = []
     for setting, water in scores.types():
         names, rows = scene_table(scores, setting, water)

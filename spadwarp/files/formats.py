@@ -25,7 +25,7 @@ from spadwarp.files.loader import load, locate
 from spadwarp.frames import Frames, FramesFile, Receiver, SequenceFile, detect
 from spadwarp.io.arrays import write_array, write_exr
 from spadwarp.io.paths import atomic_path, write_file
-from spadwarp.io.text import write_text
+from spadwarp.io.text import json_text, write_text
 from spadwarp.result import Channel, analyser_channel
 from spadwarp.result.file import exr_notes
 from spadwarp.result.result import Result
@@ -399,8 +399,8 @@ def _write_result(result: Result, path: Path, ending: str, frames: Any) -> Path:
         return write_array(path, result.histogram)
     if ending == ".npz":
         gate = result.scene.gate
-        arrays = {"histogram": result.histogram, **_time_axis(gate.start, gate.bin_width, gate.bins)}
-        return write_file(path, partial(np.savez_compressed, **arrays, true_depth=result.truth.depth))
+        arrays = {"histogram": result.histogram, "true_depth": result.truth.depth}
+        return _save_npz(path, arrays, _time_axis(gate.start, gate.bin_width, result.scene), gate.bins)
     if ending == ".png":
         return _save_png(path, result.depth())
     if ending == ".exr":
@@ -452,19 +452,25 @@ def _write_npy(frames: FrameSequence, path: Path, chosen: range) -> Path:
     return path
 
 
-def _time_axis(start: float, width: float, bins: int) -> dict[str, Any]:
-    return {"time": start + (np.arange(bins) + 0.5) * width, "bin_width": width, "gate_start": start}
+def _time_axis(start: float, width: float, scene: Scene | None) -> dict[str, float]:
+    """What turns a bin into a time of flight, and that into a length, by the names of our own files."""
+    water = {} if scene is None else {"group_index": scene.medium.group_index}
+    return {"gate_start": start, "bin_width": width, **water}
+
+
+def _save_npz(path: Path, arrays: dict[str, Any], axis: dict[str, Any], bins: int) -> Path:
+    time = axis["gate_start"] + (np.arange(bins) + 0.5) * axis["bin_width"]
+    return write_file(path, partial(np.savez_compressed, **arrays, **axis, time=time))
 
 
 def _write_npz(frames: FrameSequence, path: Path, chosen: range) -> Path:
     """As `_write_npy`, with axes."""
     first, cubes = frames.frame(chosen[0]), [frames.frame(number).main for number in chosen]
     whole = cubes[0] if len(cubes) == 1 else np.stack(cubes)
-    arrays: dict[str, Any] = {"depth": whole}
-    if first.counts is not None:
-        arrays = {"counts": whole, **_time_axis(first.gate_start, first.bin_width, whole.shape[-1])}
-        arrays |= {"pulses": first.pulses} | ({} if first.depth is None else {"true_depth": first.depth})
-    return write_file(path, partial(np.savez_compressed, **arrays))
+    if first.counts is None:
+        return write_file(path, partial(np.savez_compressed, depth=whole))
+    arrays = {"counts": whole, "pulses": first.pulses} | ({} if first.depth is None else {"true_depth": first.depth})
+    return _save_npz(path, arrays, _time_axis(first.gate_start, first.bin_width, first.scene), whole.shape[-1])
 
 
 def _save_png(path: Path, depth: NDArray[Any]) -> Path:
@@ -508,7 +514,7 @@ def _write_mat(
         "bin": true_bins,
         "range_bins": true_bins,
         "bin_size": frame.bin_width,
-        "gate_start": frame.gate_start,
+        **_time_axis(frame.gate_start, frame.bin_width, frame.scene),
         "depth": np.nan_to_num(frame.depth),
         "intensity": (signal / max(float(signal.max()), 1e-300)).astype(np.float32),
         "SBR": photons / frame.background if frame.background > 0 else np.inf,
@@ -549,7 +555,8 @@ def _write_ptu(frames: FrameSequence, path: Path, chosen: range) -> Path:
     side = 1.0 if first.scene is None or np.isnan(seen) else 1e6 * seen * first.scene.camera.pixel_tangent
     comment = (
         f"Counts of a simulated SPAD array, {first.pulses} pulses a frame. "
-        f"Bin 0 begins at {first.gate_start * 1e9:.6f} ns of flight."
+        f"Bin 0 begins at {first.gate_start * 1e9:.6f} ns of flight"
+        + ("." if first.scene is None else f", group index {first.scene.medium.group_index:.6f}.")
     )
     with (
         atomic_path(path) as temporary,
@@ -715,25 +722,29 @@ def write_lidar(result: Result, path: Path, *, seed: int = 0) -> list[Path]:
         import pyarrow
         import pyarrow.parquet
 
-        return [write_file(path, partial(pyarrow.parquet.write_table, pyarrow.table(cloud.columns())))]
-    return [_write_las(cloud, path)]
+        axis = _time_axis(result.scene.gate.start, result.scene.gate.bin_width, result.scene)
+        table = pyarrow.table(cloud.columns(), metadata={name: str(value) for name, value in axis.items()})
+        return [write_file(path, partial(pyarrow.parquet.write_table, table))]
+    return [_write_las(cloud, path, result.scene)]
 
 
-def _las_header(point_format: int, points: Floats) -> Any:
+def _las_header(point_format: int, points: Floats, scene: Scene) -> Any:
     import laspy
 
     header = laspy.LasHeader(version="1.4", point_format=point_format)
     header.scales, header.offsets = np.full(3, _COORDINATE), np.floor(points.min(axis=0))
     header.global_encoding.wkt = True
     header.generating_software = "spadwarp"
+    axis = json_text(_time_axis(scene.gate.start, scene.gate.bin_width, scene)).encode()
+    header.vlrs.append(laspy.VLR("LASF_Spec", 3, "time of flight, SI units", axis))  # 3: text
     return header
 
 
-def _write_las(cloud: PhotonCloud, path: Path) -> Path:
+def _write_las(cloud: PhotonCloud, path: Path, scene: Scene) -> Path:
     """A point for each photon, format 6."""
     import laspy
 
-    header = _las_header(6, cloud.position)
+    header = _las_header(6, cloud.position, scene)
     extra = {name: getattr(cloud, name) for name in ("shot", "pulse", "time_of_flight", "component", "target")}
     header.add_extra_dims([laspy.ExtraBytesParams(name=name, type=array.dtype) for name, array in extra.items()])
     las = laspy.LasData(header)
@@ -773,7 +784,7 @@ def _write_waveforms(result: Result, path: Path, seed: int) -> list[Path]:
     peak = samples.argmax(axis=1)
     flight = frames.gate_start + (peak + 0.5) * frames.bin_width
     points = _positions(result, at, flight)
-    header = _las_header(9, points)
+    header = _las_header(9, points, scene)
     header.global_encoding.waveform_data_packets_external = True
     descriptor = laspy.vlrs.known.WaveformPacketVlr(100, "counts of time bins")
     fields = (8 * samples.itemsize, 0, samples.shape[1], round(spacing), 1.0, 0.0)

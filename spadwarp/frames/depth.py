@@ -42,6 +42,7 @@ class Histograms:
     values: NDArray[Any]  # `[H, W, T]` or `[frames, H, W, T]`, not negative; counts are integers, rates are not
     bin_width: float | None = None  # [s]
     gate_start: float = 0.0  # time of flight at the lower edge of bin 0 [s]
+    group_index: float | None = None  # of the water, where there is no scene
     background: NDArray[np.float32] | None = None
     """Expected background in the unit of `values`, of a shape that `arrival_time` takes."""
     level_known: bool = True  # whether it is known apart from these values
@@ -265,7 +266,7 @@ def depth_of(
     Args:
         histograms: From `spadwarp.frames.read_histograms`.
         method: See `spadwarp.arrival_time`; `"matched"` and `"likelihood"` need a response.
-        group_index: Vacuum speed of light over that of the pulse, ≥ 1; a simulation has its own.
+        group_index: Vacuum speed of light over that of the pulse, ≥ 1; default: that of the file.
         horizontal_fov_deg: Full horizontal field of view of a measuring camera with square pixels, in (0, 180).
         background: Expected background in the unit of the values, ≥ 0, as `arrival_time` takes it; or the law by which
             `estimate_background` estimates it: "decay", "flat" or "none". Default: that of the file; else "decay" of
@@ -278,6 +279,7 @@ def depth_of(
     values, filtered = histograms.values, method in ("matched", "likelihood")
     height, width = values.shape[-3:-1]
     response = histograms.response if filtered else histograms.irf
+    group_index = histograms.group_index if group_index is None else group_index
     missing = {
         "bin width is missing (bin_width): the file does not hold it": histograms.bin_width,
         "group index is missing (group_index): 1 in air, 1.3566 in fresh water, 1.3638 in seawater": histograms.scene

@@ -1,4 +1,4 @@
-"""Histograms from files: those that spadwarp wrote, and measured ones (`.npy`, `.mat`, `.h5`, `.ptu`).
+"""Histograms from files: those that spadwarp wrote, and measured ones (`.npy`, `.npz`, `.mat`, `.h5`, `.ptu`).
 
 What a measured file does not say is asked for by name, or assumed with a warning; what was inferred is in the notes.
 """
@@ -9,7 +9,7 @@ import logging
 import math
 import re
 import warnings
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import closing, contextmanager
 from functools import partial
 from pathlib import Path
@@ -21,7 +21,7 @@ from numpy.typing import NDArray
 from spadwarp.frames.depth import Histograms
 from spadwarp.frames.file import FramesFile, is_frames_file
 from spadwarp.frames.response import InstrumentResponse, detector_response
-from spadwarp.io.arrays import read_npy
+from spadwarp.io.arrays import read_npy, read_npz
 from spadwarp.io.hdf5 import hdf5_format, open_hdf5
 from spadwarp.io.mat import SparseMatrix, Variable, open_mat
 from spadwarp.io.paths import existing_file, reading
@@ -31,7 +31,7 @@ from spadwarp.values import ArgumentError, FileError, SpadwarpWarning, check_rea
 
 __all__ = ["read_histograms"]
 
-_HDF5, _ARRAYS = (".h5", ".hdf5"), (".h5", ".hdf5", ".npy", ".mat")
+_HDF5, _ARRAYS = (".h5", ".hdf5"), (".h5", ".hdf5", ".npy", ".npz", ".mat")
 ENDINGS = (*_ARRAYS, ".ptu")
 """Of files that may hold histograms."""
 
@@ -51,6 +51,7 @@ class _Raw(NamedTuple):
     notes: tuple[str, ...] = ()
     bin_width: float | None = None
     gate_start: float | None = None  # time of flight at the time from which the file counts [s]
+    group_index: float | None = None
     first: float = 0.0  # begin of bin 0 after that time [s]
     ordered: bool = False  # whether the axes are `[H, W, T]` or `[frames, H, W, T]`
     options: tuple[str, ...] = ()  # what may be given of such a file, beside what every file takes
@@ -71,13 +72,13 @@ def read_histograms(
 ) -> Histograms:
     """Reads histograms; the ending of the file says which kind of file it is.
 
-    `.h5`, `.hdf5`: a result or frames of spadwarp, or an array of another program. `.npy`, `.mat`, `.ptu`: as in
-    docs/own_counts.md. Floats that are all whole count as counts.
+    `.h5`, `.hdf5`: a result or frames of spadwarp, or an array of another program. `.npy`, `.npz`, `.mat`, `.ptu`:
+    as in docs/own_counts.md. Floats that are all whole count as counts.
 
     Args:
         path: The file.
-        dataset: Name of the array in a `.mat` or `.h5` file; default: of a `.mat` the sparse matrix, the cells, else
-            the largest array of three or four dimensions; of a `.h5` the only such array.
+        dataset: Name of the array in a `.mat`, `.npz` or `.h5` file; default: of a `.mat` the sparse matrix, the cells,
+            else the largest array of three or four dimensions; of the others the only such array.
         axes: Order of an array's axes, a letter for each: y rows, x columns, t bins, n frames, such as "yxt", "tyx" or
             "nyxt"; default: bins last, or first if only then the image is one.
         image_size: (height, width) where pixels stand one after the other, or are scanned without an image's header.
@@ -109,10 +110,13 @@ def read_histograms(
         return _read_own(path, channel)
     if channel != "I":
         raise ArgumentError(f"channel = {channel!r}: only results have channels, not {path}")
-    if path.suffix.lower() == ".ptu":
-        raw = _reading(path, _read_ptu, image_size, sum_frames)
-    else:
-        raw = _reading(path, _read_arrays, dataset, image_size, tag_unit, bin_width)
+    if path.suffix.lower() not in ENDINGS:
+        raise FileError(f"{path}: ending {path.suffix!r} is not one of {', '.join(ENDINGS)}")
+    with reading(path):
+        if path.suffix.lower() == ".ptu":
+            raw = _read_ptu(path, image_size, sum_frames)
+        else:
+            raw = _read_arrays(path, dataset, image_size, tag_unit, bin_width)
     if idle := [name for name, value in given.items() if value is not None and name not in raw.options]:
         raise ArgumentError(f"{path}: {' and '.join(idle)} cannot be given; it takes {', '.join(raw.options)}")
     values, notes = _checked(raw.values, path), list(raw.notes)
@@ -138,6 +142,7 @@ def read_histograms(
         values=np.ascontiguousarray(values),
         bin_width=bin_width,
         gate_start=(gate_start if gate_start is not None else raw.gate_start or 0.0) + raw.first,
+        group_index=raw.group_index,
         irf=irf,
         response=irf,
         notes=tuple(notes),
@@ -175,14 +180,6 @@ def _read_own(path: Path, channel: Channel) -> Histograms:
         response=detector_response(scene.detector, scene.laser),
         scene=scene,
     )
-
-
-def _reading(path: Path, read: Callable[..., _Raw], *facts: Any) -> _Raw:
-    """What a reader reads from a path; whatever it raises becomes a `FileError`."""
-    if path.suffix.lower() not in ENDINGS:
-        raise FileError(f"{path}: ending {path.suffix!r} is not one of {', '.join(ENDINGS)}")
-    with reading(path):
-        return read(path, *facts)
 
 
 def _checked(values: NDArray[Any], path: Path) -> NDArray[Any]:
@@ -252,6 +249,9 @@ def _arrays(path: Path) -> Iterator[dict[str, Variable]]:
     elif ending == ".npy":
         array = read_npy(path)
         yield {"": Variable("dense", array.shape, lambda: array)}
+    elif ending == ".npz":
+        arrays = read_npz(path, largest=_MOST_VALUES)
+        yield {name: Variable("dense", array.shape, partial(np.asarray, array)) for name, array in arrays.items()}
     else:
         with closing(open_hdf5(path)) as file:
             yield {
@@ -304,8 +304,8 @@ def _read_arrays(
         value = chosen.read()
         numbers = {
             key: float(np.asarray(variables[key].read()).ravel()[0])
-            for key in ("bin_size", "gate_start")
-            if is_mat and key in variables and variables[key].kind == "dense" and math.prod(variables[key].shape) == 1
+            for key in ("bin_size", "bin_width", "gate_start", "group_index")
+            if key in variables and variables[key].kind == "dense" and math.prod(variables[key].shape) == 1
         }
     others = f", not {', '.join(candidates[1:])}" if len(candidates) > 1 else ""
     notes = [f"reads {name}{others}"] if name and not dataset and (others or not is_mat) else []
@@ -313,15 +313,18 @@ def _read_arrays(
         if tag_unit is None:
             raise ArgumentError(f"{path}: the unit of the time tags in {name} is missing (tag_unit)")
         return _of_tags(value, tag_unit, bin_width, notes)
-    known = width if 1e-15 < (width := numbers.get("bin_size", 0.0)) < 1e-3 else None
+    width = numbers.get("bin_size", numbers.get("bin_width", 0.0))
+    known = width if 1e-15 < width < 1e-3 else None
     if bin_width is None and known is not None:
-        notes.append(f"bin width {known * 1e12:g} ps from bin_size")
+        notes.append(f"bin width {known * 1e12:g} ps from the file")
+    index = numbers.get("group_index", 0.0)
     is_sparse = isinstance(value, SparseMatrix)
     if is_sparse:
         value = _of_sparse(value, image_size, variables)
         notes.append(f"{value.shape[1]} x {value.shape[0]} pixels, column by column")
     options = ("dataset", "image_size" if is_sparse else "axes")[not name :]
-    return _Raw(value, tuple(notes), known, numbers.get("gate_start"), ordered=is_sparse, options=options)
+    facts = (known, numbers.get("gate_start"), index if 1.0 <= index <= 3.0 else None)
+    return _Raw(value, tuple(notes), *facts, ordered=is_sparse, options=options)
 
 
 def _of_sparse(
@@ -432,11 +435,11 @@ def _read_ptu(path: Path, image_size: tuple[int, int] | None, sum_frames: bool) 
         if (channels := file.number_channels) > 1:
             text += f"; {channels} channels, added up"
         notes = [text, f"{len(counts)} frames; sum_frames adds them up"][: counts.ndim - 2]
-        # Time of flight at the start of bin 0, which `spadwarp export` writes in the comment.
-        is_ours = file.tags.get("CreatorSW_Name") == "spadwarp"
-        gate = re.search(r"Bin 0 begins at (\S+) ns of flight", file.comment or "") if is_ours else None
-        start = 1e-9 * float(gate[1]) if gate else None
-        return _Raw(counts, tuple(notes), float(file.tcspc_resolution), start, ordered=True, options=("image_size",))
+        # Time of flight at the start of bin 0, and the group index, which `spadwarp export` writes in the comment.
+        comment = file.comment or "" if file.tags.get("CreatorSW_Name") == "spadwarp" else ""
+        gate, water = (re.search(text, comment) for text in (r"Bin 0 begins at (\S+) ns", r"group index (\S+\d)"))
+        facts = (1e-9 * float(gate[1]) if gate else None, float(water[1]) if water else None)
+        return _Raw(counts, tuple(notes), float(file.tcspc_resolution), *facts, ordered=True, options=("image_size",))
 
 
 def _check_ptu(file: Any, path: Path) -> None:

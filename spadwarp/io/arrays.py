@@ -118,8 +118,8 @@ def read_npy(path: str | Path, *, largest: int | None = None) -> NDArray[Any]:
         return _array(file, f"{path}:", place.stat().st_size, "biufc", largest)
 
 
-def read_npz(path: str | Path, *, names: Collection[str], largest: int) -> dict[str, NDArray[Any]]:
-    """Those arrays of a `.npz` archive that have one of the names; real numbers or booleans; pickles are never loaded.
+def read_npz(path: str | Path, *, names: Collection[str] | None = None, largest: int) -> dict[str, NDArray[Any]]:
+    """Those arrays of a `.npz` archive that have one of the names, by default all of numbers; pickles are never loaded.
 
     `largest`: allowed number of values of an array. Raises `FileError`: no such file, not a `.npz` archive, shorter
     than a header says, of another type, or too large.
@@ -128,10 +128,13 @@ def read_npz(path: str | Path, *, names: Collection[str], largest: int) -> dict[
     arrays: dict[str, NDArray[Any]] = {}
     with reading(path, "damaged or not a .npz archive"), zipfile.ZipFile(place) as archive:
         for info in archive.infolist():
-            if (name := info.filename.removesuffix(".npy")) in names:
+            name = info.filename.removesuffix(".npy")
+            if names is None or name in names:
                 with archive.open(info) as file:
-                    arrays[name] = _array(file, f"{path}: {name}", info.file_size, "biuf", largest)
-    return arrays
+                    arrays[name] = _array(
+                        file, f"{path}: {name}", info.file_size, "biuf" if names else "biufU", largest
+                    )
+    return {name: array for name, array in arrays.items() if array.dtype.kind != "U"}
 
 
 def _array(file: Any, where: str, size: int, kinds: str, largest: int | None) -> NDArray[Any]:

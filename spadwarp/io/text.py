@@ -214,7 +214,7 @@ _ENDINGS = {"_m": "m", "_mm": "mm", "_s": "s", "_ns": "ns", "_ps": "ps", "_nm": 
 _ENDINGS |= dict.fromkeys(("range", "length", "distance", "extent", "centre", "limit", "depth_error"), "m")
 _ENDINGS |= dict.fromkeys(("absorption", "scattering", "extinction"), "1/m")
 _ENDINGS |= {"energy": "J", "power": "W", "rate": "Hz", "irradiance": "W/m²", "area": "m²", "seconds": "s"}
-_ENDINGS |= {"time": "s", "exposure": "s", "sigma_depth": "m", "sigma_time": "s"}
+_ENDINGS |= {"time": "s", "exposure": "s", "sigma_depth": "m", "sigma_time": "s", "psnr": "dB"}
 
 
 def fact(name: str, value: Any) -> tuple[str, str]:

@@ -147,6 +147,7 @@ def to_xarray(result: Result) -> xarray.Dataset:
     attributes = {
         "photons": result.photons,
         "photons_per_pulse": result.scene.laser.photons_per_pulse,
+        "group_index": result.scene.medium.group_index,
         "seed": str(result.seed),
         "partial": int(result.partial),
         "scene": result.scene.to_toml(),

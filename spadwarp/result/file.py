@@ -370,7 +370,8 @@ def exr_notes(content: str, scene: Scene | None, result: Result | None = None) -
     """Metadata of an EXR image of depth."""
     notes: dict[str, Any] = {"content": content, "Z": "planar depth [m]", "frame": "+x right, +y down, +z forward"}
     if scene is not None:
-        notes |= {"pixel_tangent": scene.camera.pixel_tangent, "config": scene.to_toml()}
+        notes |= {"pixel_tangent": scene.camera.pixel_tangent, "group_index": scene.medium.group_index}
+        notes["config"] = scene.to_toml()
     return notes if result is None else {**notes, "photons": result.photons, "seed": result.seed}
 
 

@@ -419,7 +419,7 @@ def in_field_unit(value: Any, info: FieldInfo) -> Any:
     try:
         return quantity(value, unit)
     except ValueError as error:
-        if unit == "1":
+        if unit == "1" and "did you mean" not in str(error):
             raise ValueError("is text; a number without quotes is needed, or a percentage") from None
         raise error from None
 

@@ -215,7 +215,7 @@ def draw_photon_sweep(
 
 
 @paper()
-def draw_reliability(tables: Mapping[tuple[str, str], NDArray[np.int64]], path: str | Path, *, note: str) -> Path:
+def draw_reliability(tables: Mapping[tuple[str, str], NDArray[np.int64]], path: str | Path) -> Path:
     """How often it was true, against the probability that was given, by tenths.
 
     `tables`: by method and what the probability is of, pixels and those of which it was true, `[10, 2]`. A bar is the
@@ -234,9 +234,9 @@ def draw_reliability(tables: Mapping[tuple[str, str], NDArray[np.int64]], path: 
         axis.set(title=title, xlim=(0, 1), ylim=(0, 1), ylabel="part of the pixels of which it is true")
         axis.minorticks_on()
         axis.set_xlabel("probability given")
-        axis.legend(loc="upper left")
         axis.label_outer()
-    figure.note(note)
+    axes[0].legend(loc="best")
+    figure.note("scenes that no training saw")
     return save(figure, path)
 
 

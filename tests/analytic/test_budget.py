@@ -81,7 +81,7 @@ def test_pulses_of_a_depth_frame_are_those_of_the_detector_unless_given():
     assert budget(own, ranges=[2.0])[0] == four and own.pulses_per_depth_frame == 2000
     frames = SCENE.with_overrides({"analytic.count_law": "per_frame", "analytic.frames": 7, "analytic.exposure": 1e-5})
     assert budget(frames, ranges=[2.0])[0].pulses == pytest.approx(7 * 1e-5 * 20e6)
-    with pytest.warns(SpadwarpWarning, match="no number depends on detector.pulses_per_frame: .* takes its place"):
+    with pytest.warns(SpadwarpWarning, match="no number depends on detector.pulses_per_frame: .* has its place"):
         assert sweep(own, vary="detector.pulses_per_frame=100,200").is_flat
     assert not sweep(SCENE, vary="detector.pulses_per_frame=100,200").is_flat
 

@@ -132,17 +132,13 @@ def test_what_is_wrong_with_a_command_is_named(line, scene, done, tmp_path):
 
 
 @pytest.mark.slow
-def test_a_date_or_rank_of_the_environment_that_is_no_number(scene, tmp_path, monkeypatch):
+def test_a_date_of_the_environment_that_is_no_number(scene, tmp_path, monkeypatch):
     monkeypatch.setenv("SOURCE_DATE_EPOCH", "yesterday")
     pdf = ("--set", "output.png=true", "--set", "output.pdf=true", "--photons", "1e3")
     # And a device that is named twice.
     complaint = run("simulate", scene, "--out", tmp_path / "out", *pdf, "--device", "cpu,cpu").stderr
     assert "cpu is named more than once" in complaint
     assert (tmp_path / "out" / "depth.pdf").is_file() and os.environ["SOURCE_DATE_EPOCH"] == "yesterday"
-    monkeypatch.setenv("RANK", "²")
-    (tmp_path / "train.toml").write_text('model = "dncnn"\ndata = "none"\n')
-    complaint = run("train", tmp_path / "train.toml", "--out", tmp_path / "weights", code=2).stderr
-    assert "environment variable RANK = '²' is not an integer" in complaint
 
 
 def test_a_terminal_may_lack_letters(scene):

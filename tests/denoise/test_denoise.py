@@ -17,6 +17,7 @@ from spadwarp import ArgumentError, FileError
 from spadwarp.dataset import Plan
 from spadwarp.denoise import baselines, files, network_files
 from spadwarp.denoise.frames import depth_frames, fill_missing
+from spadwarp.denoise.inference import estimate_frames
 from spadwarp.evaluation import datasets, photon_counts
 from spadwarp.frames import record_frames
 
@@ -108,7 +109,8 @@ def test_evaluation_and_report(dataset, tmp_path):
     middle = spadwarp.evaluation.evaluate(dataset, models=("median",), frames=2, crop=(32, 24))
     assert "the middle 32 x 24 pixels" in middle.summary
     assert middle.samples["staircase", "0.480"].clean.shape == (24, 32)
-    run("evaluate", dataset, "--models", "median", "--frames", 1, "--report", tmp_path)
+    outcome = run("evaluate", dataset, "--models", "median", "--frames", 1, "--report", tmp_path, "--quiet")
+    assert "median" in outcome.stdout and not outcome.stderr  # the result, and nothing about how far it is
     page = (tmp_path / "report.html").read_text()
     page, pictures = re.subn(r"data:image/png;base64,[\w+/=]+", "", page)  # any letters may follow there
     assert pictures == 5 and "http" not in page
@@ -130,11 +132,33 @@ def test_evaluation_refuses_what_it_cannot_do(dataset, tmp_path):
             spadwarp.evaluation.evaluate(folder, **options)
 
 
+def validation_psnr(dataset, method, windows=(5,), **options):
+    """Mean over target and level of the PSNR of the frames, by its definition; with the best window at each."""
+    levels = {}
+    for item in spadwarp.dataset.FrameReader(dataset, "validation", fields=("noisy", "clean", "bound", "prior")):
+        noisy, clean, bound, prior = (item[name][0] for name in ("noisy", "clean", "bound", "prior"))
+        start, stop = map(float, item["gate"])
+        frames = depth_frames(noisy, gate=(start, stop), density=prior)
+        seen = np.isfinite(bound) & (clean >= start) & (clean < stop)
+        of_level = levels.setdefault((int(item["target"]), f"{item['backscatter_fraction']:.3f}"), {})
+        for window in windows:
+            found = estimate_frames(frames, model=method, window=window, **options).depth[0]
+            bits = [np.round(255 * np.clip((depth[seen] - start) / (stop - start), 0, 1)) for depth in (found, clean)]
+            psnr = 20 * np.log10(255) - 10 * np.log10(np.mean(np.subtract(*bits) ** 2))
+            of_level.setdefault(window, []).append(psnr)
+    return np.mean([max(map(np.mean, of_level.values())) for of_level in levels.values()])
+
+
 @pytest.mark.slow
 def test_training_from_a_dataset(dataset, tmp_path):
     file, out, own = tmp_path / "recipe.toml", tmp_path / "run", tmp_path / "run" / "usdn.safetensors"
     file.write_text(f'model = "usdn"\ndata = "{dataset}"\n[optimiser]\nsteps = 2\nbatch = 2\ncrop = 32\n')
-    run("train", file, "--out", out, "--device", "cpu")
+    printed = run("train", file, "--out", out, "--device", "cpu", "--json", tmp_path / "printed.json").stdout
+    numbers = json.loads((tmp_path / "printed.json").read_text())
+    options = {"input": {}, "median": {"windows": baselines.MEDIAN_WINDOWS}, "usdn": {"weights": own}}
+    for name, method in {"input_psnr": "input", "median_psnr": "median", "psnr": "usdn"}.items():
+        expected = validation_psnr(dataset, method, **options[method])
+        assert numbers[name] == pytest.approx(expected, abs=2e-3) and f"{expected:.4g} dB" in printed, name
     assert {path.name for path in out.iterdir()} >= {"usdn.safetensors", "log.jsonl", "curves.png"}
     assert network_files.weights_metadata("usdn", own)["seed"] == "0"
     found = spadwarp.evaluation.evaluate(dataset, models=("usdn",), frames=1, weights=own, device="cpu")

@@ -1,6 +1,7 @@
 """What a lidar delivers: photons and waveforms, read back by the programs that others read them with."""
 
 import dataclasses
+import json
 import struct
 
 import numpy as np
@@ -81,6 +82,8 @@ def test_the_table_is_that_of_pandas(result, cloud, tmp_path):
     assert sorted(table.columns) == sorted(names.split()) and len(table) == len(cloud)
     np.testing.assert_array_equal(table[["x", "y", "z"]], cloud.position)
     np.testing.assert_array_equal(table.component, np.array([*COMPONENTS, "noise"])[cloud.component])
+    index = pytest.importorskip("pyarrow.parquet").read_schema(path).metadata[b"group_index"]
+    assert float(index) == result.scene.medium.group_index
     with pytest.raises(spadwarp.ArgumentError, match="for a result"):
         spadwarp.export(spadwarp.detect(result, seed=1, device="cpu"), tmp_path / "frames.parquet")
 
@@ -91,6 +94,8 @@ def test_points_are_right_to_a_millimetre(result, cloud, tmp_path, ending):
     (path,) = spadwarp.export(result, tmp_path / f"photons.{ending}", seed=3)
     las = laspy.read(path)
     assert str(las.header.version) == "1.4" and las.header.point_format.id == 6
+    axis = json.loads(las.header.vlrs.get_by_id("LASF_Spec", [3])[0].record_data_bytes())
+    assert axis == {"gate_start": 0.0, "bin_width": result.scene.gate.bin_width, "group_index": 1.35}
     np.testing.assert_allclose(las.xyz, cloud.position, rtol=0.0, atol=1e-4)
     np.testing.assert_allclose(las.gps_time, cloud.time, rtol=1e-12)
     classes = np.array([40, 40, 45, 7])[cloud.component]

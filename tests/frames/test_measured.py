@@ -10,7 +10,6 @@ import numpy as np
 import pytest
 
 import spadwarp
-from helpers.synthetic_result import make_result, make_scene
 from spadwarp.frames import instrument_response, read_histograms
 from spadwarp.values import ArgumentError, FileError, SpadwarpWarning
 
@@ -160,17 +159,6 @@ def test_tags_are_sorted_into_wider_bins_and_begin_where_the_first_one_is(files,
     scipy_io.savemat(tmp_path / "tags.mat", {"Ts": cells(counts, 0)})
     found = read_histograms(tmp_path / "tags.mat", tag_unit=4e-12, **START)
     assert np.array_equal(found.values, counts[..., 4:5]) and found.gate_start == pytest.approx(16e-12)
-
-
-def test_our_own_export_is_read_with_its_counts_and_its_axis(tmp_path):
-    result = make_result(make_scene(width=6, height=4))
-    frames = spadwarp.detect(result, pulses=500, frames=1, seed=2, device="cpu")
-    [path] = spadwarp.export(frames, tmp_path / "a.mat", result=result)
-    found = read_histograms(path)
-    assert np.array_equal(found.values, frames.counts[0])
-    assert (found.bin_width, found.gate_start) == pytest.approx((frames.bin_width, frames.gate_start))
-    assert any("reads spad, not rates" in note for note in found.notes)
-    assert read_histograms(path, dataset="rates").values.dtype.kind == "f"
 
 
 def test_frames_stay_frames_in_every_format(tmp_path):

@@ -148,7 +148,7 @@ CATEGORIES: dict[str, Callable[[random.Random, Corpus], Case]] = {
     "exr": _damaged(ON_AN_EXR, "depth.exr", others=("scene.toml",)),
     "hdf5": _hdf5,
     "dataset": _dataset,
-    "counts": _damaged(ON_COUNTS, "counts.npy"),
+    "counts": _damaged(ON_COUNTS, "counts.npy", "counts.npz"),
     "depth": _damaged((MEDIAN,), "depth.npy"),
     "response": _damaged(WITH_A_RESPONSE, "irf.csv", "response.npy", others=("counts.npy",)),
     "mat": _damaged(ON_COUNTS, "counts.mat", "packed.mat", "tags.mat", "sparse.mat"),

@@ -164,6 +164,7 @@ def make_corpus(folder: Path) -> None:
     spadwarp.dataset.make_dataset(small, folder / "data", device="cpu")
     # Arrays and histograms of others.
     np.save(folder / "counts.npy", COUNTS)
+    np.savez(folder / "counts.npz", counts=COUNTS, bin_width=2e-10)
     np.save(folder / "zero.npy", 0 * COUNTS)
     np.save(folder / "many.npy", np.full(COUNTS.shape, 2**62))
     np.save(folder / "gate.npy", COUNTS[..., :17])

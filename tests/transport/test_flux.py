@@ -142,6 +142,7 @@ def test_zarr_has_flux_with_its_axes(tmp_path, monkeypatch):
         [path] = spadwarp.export(found, tmp_path / "light.zarr")
     with xarray.open_zarr(path) as data:
         assert np.array_equal(data.depths_irradiance, light.values)
+        assert data.group_index == found.scene.medium.group_index
         assert np.array_equal(data.depths_irradiance_error, light.errors)
         assert data.depths_position.values.tolist() == [0.1, 0.5, 1.0] and data.depths_position.units == "m"
     (tmp_path / "mine.zarr").mkdir()

@@ -89,7 +89,7 @@ def draw_ranking(path, **_):
 def draw_reliability(path, **_):
     table = np.stack([np.full(10, 500), np.linspace(20, 480, 10)], axis=1).astype(np.int64)
     tables = {(name, of): table for name in ("pyramid", "histograms") for of in ("target", "confidence")}
-    evaluation.draw_reliability(tables, path, note="scenes that no training saw")
+    evaluation.draw_reliability(tables, path)
 
 
 def draw_photon_sweep(path, **_):
