@@ -116,25 +116,19 @@ def _make_score(dtype: Any, likelihood: bool) -> wp.Function:
     """The score of a delay, by the log-matched filter or the likelihood."""
 
     @wp.func
-    def filter_score(
+    def score_of(
         histogram: wp.array2d[dtype], search: _Search, pixel: int, phases: int, least: float, beat: float
     ) -> float:
-        phase = phases & (PHASES - 1)
-        base = (phases >> _PHASE_BITS) + search.lowest_tap
-        score = float(0.0)
-        for tap in range(wp.max(0, search.first - base), wp.min(search.response.shape[1], search.stop - base)):
-            score += float(histogram[pixel, base + tap]) * search.response[phase, tap]
-        return score
-
-    @wp.func
-    def profile_likelihood(
-        histogram: wp.array2d[dtype], search: _Search, pixel: int, phases: int, least: float, beat: float
-    ) -> float:
-        # max over S >= 0 of sum n ln(1 + S h / B) - S sum h: the log-likelihood ratio of a return at this delay.
         phase = phases & (PHASES - 1)
         base = (phases >> _PHASE_BITS) + search.lowest_tap
         low = wp.max(0, search.first - base)
         high = wp.min(search.response.shape[1], search.stop - base)
+        if wp.static(not likelihood):
+            score = float(0.0)
+            for tap in range(low, high):
+                score += float(histogram[pixel, base + tap]) * search.response[phase, tap]
+            return score
+        # max over S >= 0 of sum n ln(1 + S h / B) - S sum h: the log-likelihood ratio of a return at this delay.
         counts = float(0.0)
         slope = float(0.0)
         seen = float(0.0)
@@ -176,7 +170,7 @@ def _make_score(dtype: Any, likelihood: bool) -> wp.Function:
                 value += n * wp.log(1.0 + signal * search.response[phase, tap] / floor)
         return value
 
-    return profile_likelihood if likelihood else filter_score
+    return score_of
 
 
 @memoised

@@ -388,6 +388,9 @@ CUDA_THREADS = 1 << 19
 # In one launch.
 _MOST_PHOTONS = 1 << 26
 
+# Additions of a photon to a volume of flux, about.
+_FLUX_ADDITIONS = 64
+
 
 def load_transport_kernel(spec: TransportSpec, device: wp.DeviceLike = None) -> None:
     """Compiles the kernel of a spec for a device, or loads it from Warp's cache, ahead of the first launch."""
@@ -444,12 +447,15 @@ def prepare_transport(
     seed = check.integer("seed", seed, 0, 2**64 - 1)
     blocks = check.integer("threads", threads, BLOCK_SIZE) // BLOCK_SIZE
     check_launch(spec, model, data, most)
-    device, split_accumulators = model.device, _split_accumulators(spec, model, data, most)
+    device, flux = model.device, model.flux.size
+    pays = model.split_accumulators and make_estimator(spec).scores
+    pays = pays and splitting_pays(model.tally_size // len(model.components), most)
+    split_accumulators = _low_words(device, data, "split_accumulators", data.tally.size, pays)
+    flux_halves = _low_words(device, data, "flux_halves", -(-flux // 2), splitting_pays(flux, _FLUX_ADDITIONS * most))
     kernel = make_transport_kernel(spec, device.is_cuda)
     sink = Sink()
     sink.tally, sink.ledger, sink.scale, sink.records = data.tally, data.ledger, model.scale, data.records
     sink.gradients, sink.low = data.gradients, split_accumulators
-    flux_halves = _flux_halves(model, data, most)
     sink.flux, sink.flux_halves = data.flux, flux_halves
     shared = None if spec.blocks else _make_world(spec, model, seed, 0)
 
@@ -463,37 +469,21 @@ def prepare_transport(
         part.cursor, part.offset = data.cursor, data.offset
         world = _make_world(spec, model, seed, threads) if shared is None else shared
         wp.launch(kernel, dim=threads, inputs=[world, sink, part], device=device, block_dim=BLOCK_SIZE)
-        if split_accumulators is not None:
-            fold_accumulators(split_accumulators, data.tally)
-        if flux_halves is not None:
-            fold_accumulators(flux_halves, data.flux)
+        for low, tally in ((split_accumulators, data.tally), (flux_halves, data.flux)):
+            if low is not None:
+                fold_accumulators(low, tally)
 
     return launch
 
 
-def _split_accumulators(spec: TransportSpec, model: Model, data: Data, photon_count: int) -> wp.array | None:
-    """Those of `data` for launches on CUDA that are large enough; None for others."""
-    if not (model.split_accumulators and model.device.is_cuda and make_estimator(spec).scores):
+def _low_words(device: wp.Device, data: Data, name: str, size: int, pays: bool) -> wp.array | None:
+    """The array of that name for a launch on CUDA for which it pays, made by the first such launch; None for others."""
+    if not (pays and device.is_cuda):
         return None
-    if not splitting_pays(model.tally_size // len(model.components), photon_count):
-        return None
-    if data.split_accumulators is None and not model.device.is_capturing:  # what is made there belongs to the graph
-        data.split_accumulators = wp.zeros(data.tally.size, dtype=wp.uint32, device=model.device)
-    return data.split_accumulators
-
-
-# Additions of a photon to a volume, about.
-_FLUX_ADDITIONS = 64
-
-
-def _flux_halves(model: Model, data: Data, photon_count: int) -> wp.array | None:
-    """Those of `data` for a launch on CUDA that is large enough; None for others."""
-    size = model.flux.size
-    if not (model.device.is_cuda and splitting_pays(size, _FLUX_ADDITIONS * photon_count)):
-        return None
-    if data.flux_halves is None and not model.device.is_capturing:
-        data.flux_halves = wp.zeros(-(-size // 2), dtype=wp.uint32, device=model.device)
-    return data.flux_halves
+    if getattr(data, name) is None and not device.is_capturing:  # what is made there belongs to the graph
+        setattr(data, name, wp.zeros(size, dtype=wp.uint32, device=device))
+    low: wp.array | None = getattr(data, name)
+    return low
 
 
 def _make_world(spec: TransportSpec, model: Model, seed: int, threads: int) -> World:
