@@ -27,7 +27,7 @@ from spadwarp.io.hdf5 import (
     read_hdf5,
     write_hdf5,
 )
-from spadwarp.result.noise import with_frames
+from spadwarp.result.analysis import with_frames
 from spadwarp.result.result import ARRAYS, Result, Truth
 from spadwarp.scene import Scene, SceneLike, Trajectory, as_scene, load_trajectory
 from spadwarp.scene.camera import camera_attributes

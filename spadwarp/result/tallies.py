@@ -11,7 +11,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from spadwarp.scene import Scene
-from spadwarp.values import ConfigError, SpadwarpError
+from spadwarp.scene.flux import FluxArray
+from spadwarp.values import ArgumentError, ConfigError, SpadwarpError
 
 __all__ = ["FluxTallies", "SignedTallies", "Tallies"]
 
@@ -295,3 +296,31 @@ def photons_per_position(scene: Scene, photon_ranges: Sequence[Range]) -> NDArra
     for start, stop in photon_ranges:  # ids that are the position modulo the number of positions
         photons += (stop - position + positions - 1) // positions - (start - position + positions - 1) // positions
     return np.repeat(np.maximum(photons, 1.0), shape[0] * shape[1] // positions).reshape(shape)
+
+
+# Flux, of all sections one after another
+
+
+def flux_arrays(scene: Scene) -> dict[str, FluxArray]:
+    """Of all sections of a scene, such as "around/fluence", in the order of the tally."""
+    found, first, absorption = dict[str, FluxArray](), 0, scene.medium.range.absorption
+    for section in scene.flux:
+        found |= {f"{section.name}/{name}": array for name, array in section.arrays(absorption, first).items()}
+        first += section.size
+    return found
+
+
+def part_of(entries: NDArray[Any], array: FluxArray) -> NDArray[Any]:
+    """An array of a tally, or of its words: a view."""
+    words = entries.shape[:-1]
+    rows = entries[..., array.entries].reshape(*words, array.shape[0], -1)
+    return rows[..., array.columns].reshape(*words, *array.shape)
+
+
+def check_flux(scene: Scene, tallies: FluxTallies | None, batches: int) -> None:
+    """Refuses tallies that are not those of the scene's sections."""
+    size, moments = sum(section.size for section in scene.flux), None if tallies is None else tallies.second_moment
+    shapes = [None if one is None else one.shape for one in (None if tallies is None else tallies.tallies, moments)]
+    needed = [(size,), (2, size) if batches else None] if scene.flux else [None, None]
+    if shapes != needed:
+        raise ArgumentError(f"flux_tallies and their second moment have the shapes {shapes}; {needed} are needed")
