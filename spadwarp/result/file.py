@@ -4,10 +4,8 @@ from __future__ import annotations
 
 import json
 import os
-import tomllib
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import replace
-from importlib.resources import files
 from pathlib import Path
 from typing import Any, Literal
 
@@ -17,6 +15,7 @@ from numpy.typing import ArrayLike, NDArray
 from spadwarp.io.arrays import read_exr, write_exr
 from spadwarp.io.hdf5 import Coordinate, Hdf5File, name_dimensions, read_hdf5, write_hdf5, write_packed
 from spadwarp.io.paths import file_within
+from spadwarp.io.text import read_toml
 from spadwarp.result.result import (
     ARRAYS,
     TABLES,
@@ -425,7 +424,7 @@ def exr_notes(content: str, scene: Scene | None, result: Result | None = None) -
 # Truth maps from the EXR files that a game engine or Blender writes
 
 _HALF_MAX = 65504.0  # the largest float16, which stands for infinity in files of float16
-_PRESETS = tomllib.loads((files("spadwarp.result") / "exr_presets.toml").read_text(encoding="utf-8"))
+_PRESETS = read_toml(Path(__file__).with_name("exr_presets.toml"))
 
 
 def load_truth_exr(

@@ -4,11 +4,9 @@ from __future__ import annotations
 
 import math
 import re
-import tomllib
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
-from importlib.resources import files
 from pathlib import Path
 from typing import Any, Literal, NamedTuple, get_args
 
@@ -17,6 +15,7 @@ from numpy.typing import NDArray
 
 from spadwarp.arrays import Floats
 from spadwarp.io.hdf5 import Coordinate, image_coordinates
+from spadwarp.io.text import read_toml
 from spadwarp.result.tallies import (
     NO_BATCHES,
     SignedTallies,
@@ -64,7 +63,7 @@ _SAMPLE = 1024  # pixels whose median stands for the target
 
 _DIMENSION_OF = {"derivatives": "parameter", "channels": "channel"}
 
-TABLES = tomllib.loads((files("spadwarp.result") / "arrays.toml").read_text(encoding="utf-8"))
+TABLES = read_toml(Path(__file__).with_name("arrays.toml"))
 ARRAYS: dict[str, tuple[Any, tuple[str, ...], str, str]] = {
     name: (np.dtype(entry["type"]).type, tuple(entry["dimensions"]), entry["unit"], entry["meaning"])
     for name, entry in TABLES["arrays"].items()
