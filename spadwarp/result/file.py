@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from spadwarp.io.arrays import read_exr, write_exr
-from spadwarp.io.hdf5 import Coordinate, Hdf5File, name_dimensions, read_hdf5, write_hdf5, write_packed
+from spadwarp.io.hdf5 import Coordinate, Hdf5File, image_chunks, name_dimensions, read_hdf5, write_hdf5, write_packed
 from spadwarp.io.paths import file_within
 from spadwarp.io.text import read_toml
 from spadwarp.result.result import (
@@ -52,7 +52,6 @@ __all__ += ["save_depth_exr", "save_result", "save_truth_maps"]
 FORMAT = "spadwarp result"
 FORMAT_VERSION = 1
 
-_CHUNK_BYTES = 1 << 20  # HDF5's default chunk cache
 _UNITS = "[1e-30, 1e30]"  # photons
 # As JSON: its integers have no limit.
 _RECORDS = ("energy_balance", "counters", "batch_moments", "timing", "provenance")
@@ -73,9 +72,7 @@ def save_result(result: Result, path: str | Path, *, compression: int = 1) -> Pa
     Raises `FileError`: the file cannot be written.
     """
     compression = check_integer("compression", compression, "[1, 9]")
-    _, height, width, bins = result.tallies.shape
-    columns = max(1, min(width, _CHUNK_BYTES // (bins * 8)))
-    chunk = max(1, min(height, _CHUNK_BYTES // (columns * bins * 8))), columns, bins
+    chunk = image_chunks(result.tallies.shape[1:], 8)
     options = {"compression": "gzip", "compression_opts": compression, "shuffle": True, "fletcher32": True}
     arrays = arrays_of(result)
     if result.scene.scan_positions > 1:

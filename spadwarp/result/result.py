@@ -3,8 +3,7 @@
 from __future__ import annotations
 
 import math
-import re
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
 from pathlib import Path
@@ -17,12 +16,15 @@ from spadwarp.arrays import Floats
 from spadwarp.io.hdf5 import Coordinate, image_coordinates
 from spadwarp.io.text import read_toml
 from spadwarp.result.tallies import (
+    GRID,
     NO_BATCHES,
     SignedTallies,
     Tallies,
+    block_parameters,
     check_flux,
     count,
     flux_arrays,
+    is_block_name,
     part_of,
     photons_per_position,
 )
@@ -520,7 +522,7 @@ class Result(Shown, ResultHead, Tallies):
             "unseen_share": self.unseen_share,
             "warnings": list(self.warnings),
             **self._noise_summary(),
-            **({"derivatives": _short_names(self.derivatives)} if self.derivatives else {}),
+            **({"derivatives": _short_names(list(self.derivatives))} if self.derivatives else {}),
             **_polarisation_summary(self),
             **({"flux": list(flux_arrays(scene))} if scene.flux else {}),
             "timing": dict(self.timing),
@@ -591,8 +593,6 @@ def water_of(scene: Scene) -> dict[str, Any]:
 
 # Derivatives and channels
 
-_BLOCK = re.compile(r"\[(\d+),(\d+),(\d+)\]")
-
 
 class Cube(NamedTuple):
     """Tallies of light or of a derivative by component, their unit, and their second moment, if there is one."""
@@ -636,6 +636,7 @@ class _SignedValues(Mapping[str, Floats]):
         self._result, self._group, self._errors = result, group, errors
         cubes = cubes_of(result, group)
         self._cubes = {name: one for name, one in cubes.items() if not errors or one.second_moment is not None}
+        self._blocks = block_parameters(list(self._cubes))
 
     def __iter__(self) -> Iterator[str]:
         return iter(self._cubes)
@@ -644,9 +645,9 @@ class _SignedValues(Mapping[str, Floats]):
         return len(self._cubes)
 
     def __getitem__(self, name: str) -> Floats:
-        if blocks := _blocks(self, name):
-            parts = np.stack([self[f"{name}[{','.join(map(str, block))}]"] for block in blocks])
-            return parts.reshape(*_shape(blocks), *parts.shape[1:])
+        if name in [f"{GRID}{kind}" for kind in self._blocks.kinds]:
+            parts = np.stack([self[one] for one in self if one.startswith(f"{name}[")])
+            return parts.reshape(*self._blocks.shape, *parts.shape[1:])
         if name not in self._cubes:
             raise KeyError(f"{name!r} is not one of the {self._group}: {', '.join(self) or 'none were asked for'}")
         result, (tallies, unit, moments) = self._result, self._cubes[name]
@@ -657,24 +658,11 @@ class _SignedValues(Mapping[str, Floats]):
         return f"{{{', '.join(map(repr, self))}}}"
 
 
-def _shape(blocks: list[tuple[int, ...]]) -> list[int]:
-    return [max(indices) + 1 for indices in zip(*blocks, strict=True)]
-
-
-def _blocks(names: Iterable[str], name: str) -> list[tuple[int, ...]]:
-    """Indices of the blocks by whose coefficient `name` a histogram is differentiated."""
-    matches = [_BLOCK.fullmatch(other.removeprefix(name)) for other in names if other.startswith(f"{name}[")]
-    return [tuple(map(int, match.groups())) for match in matches if match is not None]
-
-
-def _short_names(names: Iterable[str]) -> list[str]:
+def _short_names(names: Sequence[str]) -> list[str]:
     """For a reader: one text for all blocks, such as "medium.grid.absorption of 4 x 4 x 2 blocks"."""
-    texts = dict[str, None]()
-    for name in names:
-        kind = name.partition("[")[0]
-        blocks = _blocks(names, kind)
-        texts[f"{kind} of {' x '.join(map(str, _shape(blocks)))} blocks" if blocks else name] = None
-    return list(texts)
+    kinds, shape = block_parameters(names)
+    plain = [name for name in names if not is_block_name(name)]
+    return [*plain, *(f"{GRID}{kind} of {' x '.join(map(str, shape))} blocks" for kind in kinds)]
 
 
 # Errors
