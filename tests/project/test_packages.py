@@ -84,17 +84,14 @@ def test_arrows_point_down():
 
 @pytest.mark.parametrize("folder", [SPADWARP, KERNELS], ids=lambda folder: folder.name)
 def test_no_file_imports_itself_by_way_of_others(folder):
-    """At import time or inside functions, type hints left out."""
+    """At import time, inside functions, or for type hints."""
     names = {
         ".".join(path.relative_to(folder.parent).with_suffix("").parts).removesuffix(".__init__"): path
         for path in folder.rglob("*.py")
     }
     arrows = {}
     for name, path in names.items():
-        conditions = [node for node in nodes_of(path) if isinstance(node, ast.If)]
-        hints = {x for node in conditions if ast.unparse(node.test) == "TYPE_CHECKING" for x in ast.walk(node)}
-        found = names_imported(path, hints)
-        found = {one if one in names else one.rpartition(".")[0] for one in found}
+        found = {one if one in names else one.rpartition(".")[0] for one in names_imported(path)}
         arrows[name] = (found & set(names)) - {name, folder.name}
     list(graphlib.TopologicalSorter(arrows).static_order())  # or a CycleError that names the files
 
