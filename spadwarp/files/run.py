@@ -21,8 +21,7 @@ from spadwarp.io.paths import file_within, remove_temporaries, write_file
 from spadwarp.io.text import write_text
 from spadwarp.parallel import Forked
 from spadwarp.result import Result, load_result, save_depth_exr, save_truth_maps
-from spadwarp.result.file import read_head
-from spadwarp.result.result import difference
+from spadwarp.result.file import difference, read_head
 from spadwarp.scene import Scene
 from spadwarp.scene.camera import to_world
 from spadwarp.scene.pose import rotation_matrix

@@ -22,12 +22,13 @@ from spadwarp.io.hdf5 import (
     PIXELS,
     Hdf5File,
     hdf5_format,
+    image_chunks,
     image_coordinates,
     name_dimensions,
     read_hdf5,
     write_hdf5,
 )
-from spadwarp.result.noise import with_frames
+from spadwarp.result.analysis import with_frames
 from spadwarp.result.result import ARRAYS, Result, Truth
 from spadwarp.scene import Scene, SceneLike, Trajectory, as_scene, load_trajectory
 from spadwarp.scene.camera import camera_attributes
@@ -42,7 +43,7 @@ Progress = Callable[[str, int, int], None]
 
 FORMAT_VERSION = 1
 
-_CHUNK_BYTES, _CHUNK_TAGS = 1 << 20, 1 << 16
+_CHUNK_TAGS = 1 << 16
 _PART_BYTES = 1 << 26  # of counts that are held at a time
 _IMAGES, _DETECTION = ("frame", *PIXELS), "tags/detection"
 _TAGS: dict[str, Any] = {"frame": np.int64, "y": np.int32, "x": np.int32, "pulse": np.int64, "bin": np.int32}
@@ -335,7 +336,7 @@ class _Writer:
                 file.create_dataset(name, data=array, **(PACKED if array.ndim > 1 else {}))
             else:
                 shape, packed = (self._frames, *array.shape[1:]), dimensions[:3] == _IMAGES
-                chunks = {"chunks": _chunks(shape, array.itemsize), **PACKED} if packed else {}
+                chunks = {"chunks": (1, *image_chunks(shape[1:], array.itemsize)), **PACKED} if packed else {}
                 file.create_dataset(name, shape, array.dtype, **chunks)
         edges, (height, width, _) = part.gate_start + part.edges, part.expected.shape
         axes: dict[str, Any] = {
@@ -352,14 +353,6 @@ class _Writer:
             else:
                 described[name] = (dimensions, unit, meaning)
         name_dimensions(file, axes, described)
-
-
-def _chunks(shape: tuple[int, ...], item_bytes: int) -> tuple[int, ...]:
-    """Chunks of a part of a frame, of an array `[frames, H, W, ...]`."""
-    _, height, width, *rest = shape
-    row = item_bytes * int(np.prod(rest))
-    columns = max(1, min(width, _CHUNK_BYTES // row))
-    return (1, max(1, min(height, _CHUNK_BYTES // (row * columns))), columns, *rest)
 
 
 @dataclass(frozen=True, kw_only=True)

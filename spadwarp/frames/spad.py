@@ -29,8 +29,8 @@ from spadwarp.arrays import (
 from spadwarp.frames.depth import Method, arrival_time
 from spadwarp.frames.response import InstrumentResponse, SparseResponse, detector_response, response_matrix
 from spadwarp.io.hdf5 import PIXELS, image_coordinates
+from spadwarp.result.analysis import UNKNOWN_NOISE, noise_problem, with_frames
 from spadwarp.result.file import as_result
-from spadwarp.result.noise import UNKNOWN_NOISE, noise_problem, with_frames
 from spadwarp.result.result import Result, Truth
 from spadwarp.scene import Detector, Laser, detection_efficiency, noise_rate
 from spadwarp.values import (

@@ -11,11 +11,11 @@ import numpy as np
 
 from spadwarp.arrays import Floats
 from spadwarp.inverse.unknowns import read_unknowns, with_values
+from spadwarp.result.tallies import is_block_name
 from spadwarp.scene import Scene, SceneLike, as_scene
 from spadwarp.scene.grid import Grid
 from spadwarp.scene.medium import grid_cells
 from spadwarp.transport import RunOptions, resolve_derivatives, simulate
-from spadwarp.transport.derivatives import is_block_name
 from spadwarp.values import SEED, ArgumentError, check_integer
 
 if TYPE_CHECKING:

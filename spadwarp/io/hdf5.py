@@ -506,6 +506,17 @@ def _write_scale(file: Any, name: str, coordinate: Coordinate | int | None) -> N
     stored.make_scale(name)
 
 
+_CHUNK_BYTES = 1 << 20  # HDF5's default chunk cache
+
+
+def image_chunks(shape: Sequence[int], item_bytes: int) -> tuple[int, ...]:
+    """Chunks of an array `[H, W, ...]` that HDF5's cache holds."""
+    height, width, *rest = shape
+    row = item_bytes * math.prod(rest)
+    columns = max(1, min(width, _CHUNK_BYTES // row))
+    return max(1, min(height, _CHUNK_BYTES // (row * columns))), columns, *rest
+
+
 # Large arrays are compressed by all cores; HDF5 itself compresses with one.
 _THREADS = 16
 _LARGE = 1 << 22  # bytes from which threads are worth their start

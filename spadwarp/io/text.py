@@ -13,7 +13,7 @@ import re
 import time
 import tomllib
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import suppress
+from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Any
 
@@ -144,11 +144,8 @@ def read_columns(path: str | os.PathLike[str], columns: Mapping[str, str]) -> ND
     """
     rows: list[list[float]] = []
     named = False
-    lines = csv.reader(io.StringIO(read_text(path), newline=""))
-    try:
+    with csv_lines(path) as lines:
         for cells in lines:
-            if not cells or cells[0].lstrip().startswith("#"):
-                continue
             row: list[float] = []
             with suppress(ValueError):
                 row = [parse_number(cell) for cell, _ in zip(cells, columns, strict=False)]
@@ -161,9 +158,20 @@ def read_columns(path: str | os.PathLike[str], columns: Mapping[str, str]) -> ND
                 raise ValueError(f"{shown(','.join(cells))} is not {','.join(columns)} in finite numbers")
             else:
                 named = True
+    return np.array(rows, np.float64).reshape(-1, len(columns))
+
+
+@contextmanager
+def csv_lines(path: str | os.PathLike[str]) -> Iterator[Iterator[list[str]]]:
+    """Cells of each line of a .csv file but empty ones and those that begin with #.
+
+    Makes a `ConfigError` with the line's number of a `ValueError` in the block. Raises `FileError`.
+    """
+    lines = csv.reader(io.StringIO(read_text(path), newline=""))
+    try:
+        yield (cells for cells in lines if cells and not cells[0].lstrip().startswith("#"))
     except (ValueError, csv.Error) as error:  # the latter: a cell of more than 131 072 characters
         raise ConfigError(f"line {lines.line_num}: {error}", source=str(path)) from None
-    return np.array(rows, np.float64).reshape(-1, len(columns))
 
 
 # Writing

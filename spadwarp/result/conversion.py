@@ -10,8 +10,8 @@ from typing import TYPE_CHECKING, Any, TypeVar, overload
 import numpy as np
 
 from spadwarp.arrays import Variable, is_torch, labelled
-from spadwarp.result.flux import flux_arrays
 from spadwarp.result.result import ARRAYS, Component, Result, coordinates_of
+from spadwarp.result.tallies import flux_arrays
 from spadwarp.scene import Scene
 from spadwarp.values import ArgumentError, check_choice
 

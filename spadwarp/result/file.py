@@ -4,10 +4,8 @@ from __future__ import annotations
 
 import json
 import os
-import tomllib
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import replace
-from importlib.resources import files
 from pathlib import Path
 from typing import Any, Literal
 
@@ -15,9 +13,9 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from spadwarp.io.arrays import read_exr, write_exr
-from spadwarp.io.hdf5 import Coordinate, Hdf5File, name_dimensions, read_hdf5, write_hdf5, write_packed
+from spadwarp.io.hdf5 import Coordinate, Hdf5File, image_chunks, name_dimensions, read_hdf5, write_hdf5, write_packed
 from spadwarp.io.paths import file_within
-from spadwarp.result.flux import flux_arrays, part_of
+from spadwarp.io.text import read_toml
 from spadwarp.result.result import (
     ARRAYS,
     TABLES,
@@ -27,12 +25,22 @@ from spadwarp.result.result import (
     Truth,
     arrays_of,
     coordinates_of,
-    difference,
     shape_of,
     signed_of,
     water_of,
 )
-from spadwarp.result.tallies import FluxTallies, Range, SignedTallies, added, joined, moments_of, rebatched, total_of
+from spadwarp.result.tallies import (
+    FluxTallies,
+    Range,
+    SignedTallies,
+    added,
+    flux_arrays,
+    joined,
+    moments_of,
+    part_of,
+    rebatched,
+    total_of,
+)
 from spadwarp.scene import Scene
 from spadwarp.scene.camera import camera_attributes, pixel_directions
 from spadwarp.scene.scan import shots_of
@@ -44,7 +52,6 @@ __all__ += ["save_depth_exr", "save_result", "save_truth_maps"]
 FORMAT = "spadwarp result"
 FORMAT_VERSION = 1
 
-_CHUNK_BYTES = 1 << 20  # HDF5's default chunk cache
 _UNITS = "[1e-30, 1e30]"  # photons
 # As JSON: its integers have no limit.
 _RECORDS = ("energy_balance", "counters", "batch_moments", "timing", "provenance")
@@ -65,9 +72,7 @@ def save_result(result: Result, path: str | Path, *, compression: int = 1) -> Pa
     Raises `FileError`: the file cannot be written.
     """
     compression = check_integer("compression", compression, "[1, 9]")
-    _, height, width, bins = result.tallies.shape
-    columns = max(1, min(width, _CHUNK_BYTES // (bins * 8)))
-    chunk = max(1, min(height, _CHUNK_BYTES // (columns * bins * 8))), columns, bins
+    chunk = image_chunks(result.tallies.shape[1:], 8)
     options = {"compression": "gzip", "compression_opts": compression, "shuffle": True, "fletcher32": True}
     arrays = arrays_of(result)
     if result.scene.scan_positions > 1:
@@ -289,6 +294,45 @@ def _attributes(result: Result) -> dict[str, Any]:
 # Results added up: tallies are integers, so that the order and the devices make no difference
 
 
+def _physics(scene: Scene) -> Scene:
+    """The scene without what does not change a photon's history."""
+    transport = scene.transport.model_copy(update={"photons": 1, "seed": 0})
+    return scene.model_copy(update={"transport": transport, "output": type(scene.output)()})
+
+
+def difference(a: ResultHead, b: ResultHead) -> str:
+    """What shows that two hold photons of different runs; empty where they are of one."""
+    one, other = _physics(a.scene), _physics(b.scene)
+    if one != other:
+        sections = [name for name in type(one).model_fields if getattr(one, name) != getattr(other, name)]
+        return f"the scene of the results differs in {', '.join(sections)}: only photons and output may differ"
+    for path, now, before in zip(a.scene.files, a.file_hashes, b.file_hashes, strict=False):
+        if now != before:
+            return f"{path} is another file than it was: its content has changed between the runs"
+    pairs = {name: (getattr(a, name), getattr(b, name)) for name in ("seed", "unit")}
+    pairs["presence of errors"] = a.batch_size > 0, b.batch_size > 0
+    if isinstance(a, Result) and isinstance(b, Result):
+        pairs["list of derivatives"] = tuple(a.derivatives), tuple(b.derivatives)
+        pairs["channel"] = a.provenance.get("channel"), b.provenance.get("channel")
+        if not same_targets(a.truth, b.truth):
+            return TARGETS_DIFFER
+    for name, (mine, its) in pairs.items():
+        if mine != its:
+            return f"the {name.replace('_', ' ')} of the results differs ({mine} and {its})"
+    mine, its = a.focus_distance, b.focus_distance
+    if mine != its and (mine is None or its is None or not np.isclose(mine, its, rtol=1e-4, atol=0.0)):
+        return f"the lenses of the results differ: focus_distance is {mine} and {its} m"
+    return ""
+
+
+TARGETS_DIFFER = "the targets of the results differ, by their truth maps: was a mesh file changed?"
+
+
+def same_targets(a: Truth, b: Truth) -> bool:
+    """Whether two truth maps are of the same targets."""
+    return np.allclose(a.range, b.range, rtol=1e-4, equal_nan=True)
+
+
 def merge(results: Iterable[ResultLike]) -> Result:
     """Adds results of the same scene, seed and unit with disjoint photon ids; bit-identical to one run of all the ids.
 
@@ -378,7 +422,7 @@ def exr_notes(content: str, scene: Scene | None, result: Result | None = None) -
 # Truth maps from the EXR files that a game engine or Blender writes
 
 _HALF_MAX = 65504.0  # the largest float16, which stands for infinity in files of float16
-_PRESETS = tomllib.loads((files("spadwarp.result") / "exr_presets.toml").read_text(encoding="utf-8"))
+_PRESETS = read_toml(Path(__file__).with_name("exr_presets.toml"))
 
 
 def load_truth_exr(

@@ -3,12 +3,9 @@
 from __future__ import annotations
 
 import math
-import re
-import tomllib
-from collections.abc import Iterable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, field
 from functools import cached_property
-from importlib.resources import files
 from pathlib import Path
 from typing import Any, Literal, NamedTuple, get_args
 
@@ -17,17 +14,28 @@ from numpy.typing import NDArray
 
 from spadwarp.arrays import Floats
 from spadwarp.io.hdf5 import Coordinate, image_coordinates
-from spadwarp.result.flux import FluxValues, check_flux, flux_arrays, flux_of
-from spadwarp.result.noise import noise_ratios, photons_needed, target_noise_ratio
-from spadwarp.result.tallies import NO_BATCHES, SignedTallies, Tallies, count, photons_per_position
-from spadwarp.scene import Scene
+from spadwarp.io.text import read_toml
+from spadwarp.result.tallies import (
+    GRID,
+    NO_BATCHES,
+    SignedTallies,
+    Tallies,
+    block_parameters,
+    check_flux,
+    count,
+    flux_arrays,
+    is_block_name,
+    part_of,
+    photons_per_position,
+)
+from spadwarp.scene import Scene, noise_rate
 from spadwarp.scene.medium import NOTABLE_UNSEEN
 from spadwarp.scene.scene import Component
 from spadwarp.scene.sight import lines_of_sight
-from spadwarp.values import ArgumentError, ConfigError, FileError, Shown, check_choice, percent
+from spadwarp.values import ArgumentError, ConfigError, FileError, Shown, check_choice, check_real, percent
 
 __all__ = ["CHANNELS", "COMPONENTS", "POLARISED", "Channel", "Component", "Half", "Reconstruction", "Result", "Truth"]
-__all__ += ["analyser_channel", "component_errors", "degree_of_polarisation"]
+__all__ += ["NOISE_GOAL", "FluxValues", "PhotonsNeeded", "component_errors", "photons_needed"]
 
 COMPONENTS: tuple[Component, ...] = get_args(Component)[:3]
 """Those of every result; `Scene.components` are those of a scene."""
@@ -46,12 +54,18 @@ _FALSE_ALARM = 1e-4
 # Relative standard errors that are smaller are good enough whatever carries them.
 _SMALL_ERROR = 0.005
 
-_CAMERAS = "simulate with camera.polarisation = 'analyser' or 'stokes'"
+NOISE_GOAL = 0.1
+"""`Result.target_noise_ratio` up to which a result's noise does not show beside that of a frame's photons: it adds 5 %
+to their standard deviation."""
 
+_FWHM_PER_SIGMA = math.sqrt(8.0 * math.log(2.0))
+_NARROW = 0.2  # standard deviation [bins] of a response that leaves light in its bin
+_PART_VOXELS = 1 << 22
+_SAMPLE = 1024  # pixels whose median stands for the target
 
 _DIMENSION_OF = {"derivatives": "parameter", "channels": "channel"}
 
-TABLES = tomllib.loads((files("spadwarp.result") / "arrays.toml").read_text(encoding="utf-8"))
+TABLES = read_toml(Path(__file__).with_name("arrays.toml"))
 ARRAYS: dict[str, tuple[Any, tuple[str, ...], str, str]] = {
     name: (np.dtype(entry["type"]).type, tuple(entry["dimensions"]), entry["unit"], entry["meaning"])
     for name, entry in TABLES["arrays"].items()
@@ -125,6 +139,30 @@ class Reconstruction:
 
     histogram: NDArray[np.float32]  # float32 `[3, H, W, T]`, fraction of the emitted photons by component
     error: NDArray[np.float32]  # float32 `[H, W, T]`, of the sum over components: standard deviation and bias
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class FluxValues:
+    """One array of a section, float64, with an axis for each dimension: "fluence" `[gate, x, y, z]` [1/m²],
+    "irradiance" `[position, kind]` or "radiance" `[position, polar, azimuth]` [1/sr], of planes with a radius by m².
+
+    By emitted photon: times the energy of a pulse, or the irradiance of the sun, it is that in joules or watts.
+    """
+
+    values: Floats
+    errors: Floats | None  # standard errors; None without batches
+    dimensions: Mapping[str, Coordinate]  # values, unit and meaning of each axis
+    unit: str
+
+    def rate(self) -> Floats:
+        """Of a fluence the fluence rate [1/(m²·s)]: over the width of the gates.
+
+        Raises `ConfigError` for anything else, and for a fluence of all times.
+        """
+        gates = np.asarray(self.dimensions.get("gate", ((),))[0], np.float64)
+        if len(gates) < 2:
+            raise ConfigError("a rate needs a volume with two gates or more")
+        return self.values / (gates[1] - gates[0])
 
 
 @dataclass(frozen=True, eq=False, kw_only=True, repr=False)
@@ -253,7 +291,17 @@ class Result(Shown, ResultHead, Tallies):
     @cached_property
     def flux(self) -> Mapping[str, Mapping[str, FluxValues]]:
         """Section of `[[flux]]` → its arrays, "fluence" of a volume, "irradiance" and "radiance" of planes."""
-        return flux_of(self)
+        sections = dict[str, dict[str, FluxValues]]()
+        for name, array in flux_arrays(self.scene).items():
+            assert self.flux_tallies is not None
+            section, _, kind = name.partition("/")
+            value, errors = array.value / self.photons, None
+            counts, moments = part_of(self.flux_tallies.tallies, array), self.flux_tallies.second_moment
+            if moments is not None and self.batches > 1:
+                errors = self.batch_error(counts[None], part_of(moments, array)) * value
+            made = FluxValues(values=counts * value, errors=errors, dimensions=array.dimensions, unit=array.unit)
+            sections.setdefault(section, {})[kind] = made
+        return sections
 
     # Errors
 
@@ -326,14 +374,20 @@ class Result(Shown, ResultHead, Tallies):
 
         Raises as `standard_error` does.
         """
-        return noise_ratios(self, np.arange(self.truth.depth.size)).reshape(self.truth.depth.shape)
+        return _noise_ratios(self, np.arange(self.truth.depth.size)).reshape(self.truth.depth.shape)
 
     @cached_property
     def target_noise_ratio(self) -> float:
         """Median of `noise_ratio` over the pixels of the target in which light returned, or over all without a target;
         of 1024 of them spread over the image where there are more. Infinite if nothing returned. Raises as
         `standard_error` does."""
-        return target_noise_ratio(self)
+        target = np.isfinite(self.truth.depth)
+        returned = self.tallies.any(axis=(0, 3)) & (target | ~target.any())
+        pixels = np.flatnonzero(returned)
+        pixels = pixels[np.linspace(0, len(pixels) - 1, min(len(pixels), _SAMPLE)).astype(np.intp)]
+        ratios = _noise_ratios(self, pixels)
+        ratios = ratios[np.isfinite(ratios)]
+        return float(np.median(ratios)) if ratios.size else math.inf
 
     @property
     def relative_error(self) -> float:
@@ -468,7 +522,7 @@ class Result(Shown, ResultHead, Tallies):
             "unseen_share": self.unseen_share,
             "warnings": list(self.warnings),
             **self._noise_summary(),
-            **({"derivatives": _short_names(self.derivatives)} if self.derivatives else {}),
+            **({"derivatives": _short_names(list(self.derivatives))} if self.derivatives else {}),
             **_polarisation_summary(self),
             **({"flux": list(flux_arrays(scene))} if scene.flux else {}),
             "timing": dict(self.timing),
@@ -537,48 +591,7 @@ def water_of(scene: Scene) -> dict[str, Any]:
     return {**{name: getattr(scene.medium, name) for name in names}, **scene.medium.phase_parameters}
 
 
-def _physics(scene: Scene) -> Scene:
-    """The scene without what does not change a photon's history."""
-    transport = scene.transport.model_copy(update={"photons": 1, "seed": 0})
-    return scene.model_copy(update={"transport": transport, "output": type(scene.output)()})
-
-
-def difference(a: ResultHead, b: ResultHead) -> str:
-    """What shows that two hold photons of different runs; empty where they are of one."""
-    one, other = _physics(a.scene), _physics(b.scene)
-    if one != other:
-        sections = [name for name in type(one).model_fields if getattr(one, name) != getattr(other, name)]
-        return f"the scene of the results differs in {', '.join(sections)}: only photons and output may differ"
-    for path, now, before in zip(a.scene.files, a.file_hashes, b.file_hashes, strict=False):
-        if now != before:
-            return f"{path} is another file than it was: its content has changed between the runs"
-    pairs = {name: (getattr(a, name), getattr(b, name)) for name in ("seed", "unit")}
-    pairs["presence of errors"] = a.batch_size > 0, b.batch_size > 0
-    if isinstance(a, Result) and isinstance(b, Result):
-        pairs["list of derivatives"] = tuple(a.derivatives), tuple(b.derivatives)
-        pairs["channel"] = a.provenance.get("channel"), b.provenance.get("channel")
-        if not same_targets(a.truth, b.truth):
-            return TARGETS_DIFFER
-    for name, (mine, its) in pairs.items():
-        if mine != its:
-            return f"the {name.replace('_', ' ')} of the results differs ({mine} and {its})"
-    mine, its = a.focus_distance, b.focus_distance
-    if mine != its and (mine is None or its is None or not np.isclose(mine, its, rtol=1e-4, atol=0.0)):
-        return f"the lenses of the results differ: focus_distance is {mine} and {its} m"
-    return ""
-
-
-TARGETS_DIFFER = "the targets of the results differ, by their truth maps: was a mesh file changed?"
-
-
-def same_targets(a: Truth, b: Truth) -> bool:
-    """Whether two truth maps are of the same targets."""
-    return np.allclose(a.range, b.range, rtol=1e-4, equal_nan=True)
-
-
 # Derivatives and channels
-
-_BLOCK = re.compile(r"\[(\d+),(\d+),(\d+)\]")
 
 
 class Cube(NamedTuple):
@@ -623,6 +636,7 @@ class _SignedValues(Mapping[str, Floats]):
         self._result, self._group, self._errors = result, group, errors
         cubes = cubes_of(result, group)
         self._cubes = {name: one for name, one in cubes.items() if not errors or one.second_moment is not None}
+        self._blocks = block_parameters(list(self._cubes))
 
     def __iter__(self) -> Iterator[str]:
         return iter(self._cubes)
@@ -631,9 +645,9 @@ class _SignedValues(Mapping[str, Floats]):
         return len(self._cubes)
 
     def __getitem__(self, name: str) -> Floats:
-        if blocks := _blocks(self, name):
-            parts = np.stack([self[f"{name}[{','.join(map(str, block))}]"] for block in blocks])
-            return parts.reshape(*_shape(blocks), *parts.shape[1:])
+        if name in [f"{GRID}{kind}" for kind in self._blocks.kinds]:
+            parts = np.stack([self[one] for one in self if one.startswith(f"{name}[")])
+            return parts.reshape(*self._blocks.shape, *parts.shape[1:])
         if name not in self._cubes:
             raise KeyError(f"{name!r} is not one of the {self._group}: {', '.join(self) or 'none were asked for'}")
         result, (tallies, unit, moments) = self._result, self._cubes[name]
@@ -644,24 +658,11 @@ class _SignedValues(Mapping[str, Floats]):
         return f"{{{', '.join(map(repr, self))}}}"
 
 
-def _shape(blocks: list[tuple[int, ...]]) -> list[int]:
-    return [max(indices) + 1 for indices in zip(*blocks, strict=True)]
-
-
-def _blocks(names: Iterable[str], name: str) -> list[tuple[int, ...]]:
-    """Indices of the blocks by whose coefficient `name` a histogram is differentiated."""
-    matches = [_BLOCK.fullmatch(other.removeprefix(name)) for other in names if other.startswith(f"{name}[")]
-    return [tuple(map(int, match.groups())) for match in matches if match is not None]
-
-
-def _short_names(names: Iterable[str]) -> list[str]:
+def _short_names(names: Sequence[str]) -> list[str]:
     """For a reader: one text for all blocks, such as "medium.grid.absorption of 4 x 4 x 2 blocks"."""
-    texts = dict[str, None]()
-    for name in names:
-        kind = name.partition("[")[0]
-        blocks = _blocks(names, kind)
-        texts[f"{kind} of {' x '.join(map(str, _shape(blocks)))} blocks" if blocks else name] = None
-    return list(texts)
+    kinds, shape = block_parameters(names)
+    plain = [name for name in names if not is_block_name(name)]
+    return [*plain, *(f"{GRID}{kind} of {' x '.join(map(str, shape))} blocks" for kind in kinds)]
 
 
 # Errors
@@ -727,12 +728,6 @@ def _spreads(result: Result) -> dict[Component, tuple[int, int, int, int]]:
     return found
 
 
-def pixel_standard_error(result: Result, row: int, column: int) -> Floats:
-    """`Result.standard_error` of one pixel, float64 `[T]`, without that of the others."""
-    error = result.batch_error(result.tallies[:, row, column], result.known_moment[:, row, column])
-    return np.asarray(error * result.tally_value[row, column])
-
-
 def _threshold(batches: int) -> float:
     """The share that equal batches exceed with a probability of _FALSE_ALARM at most, but _DECIDING_SHARE at least.
 
@@ -748,86 +743,6 @@ def _threshold(batches: int) -> float:
     return max(_DECIDING_SHARE, float(betaincinv(0.5, 0.5 * batches - 1.0, 1.0 - _FALSE_ALARM / batches)))
 
 
-# Channels of polarised light
-
-
-def analyser_channel(result: Result, channel: Channel) -> Result:
-    """The result with the light of one channel alone, for all that takes a result: counts, depth, bounds, pictures.
-
-    "raman" and "fluorescence" are light of other wavelengths, for a receiver with a filter that passes them alone; the
-    detector is taken as it is given, so that its efficiency is to be that at their wavelength.
-
-    "I" is the result itself, without an analyser; "co" passes an analyser at `camera.analyser_angle_deg` of the
-    camera's `analyser_extinction_ratio`, "cross" one across it. A camera of four Stokes cubes has both. Ambient light
-    counts as unpolarised: ½(1 + 1/E) of it passes, of `detector.ambient_rate` and of daylight.
-
-    The energy balance and the counters stay those of all light; from Stokes cubes the channel has no standard errors.
-
-    Raises `ArgumentError`: no such channel; `ConfigError`: the result was simulated without channels.
-    """
-    if check_choice("channel", channel, CHANNELS) == "I":
-        return result
-    of_polarisation = channel in POLARISED
-    if not (result.scene.camera.channels if of_polarisation else channel in result.channels):
-        own, lines = result.provenance.get("channel"), f"give medium.inelastic with process = {channel!r}"
-        problem = f"the result has none; {_CAMERAS if of_polarisation else lines}"
-        problem = f"the result holds {own!r} alone; take that of the run" if own else problem
-        raise ConfigError(f"channel = {channel!r}: {problem}", source=result.scene.source)
-    tallies, unit = _channel_tallies(result, channel)
-    lines_left_out = result.scene.with_overrides({"medium.inelastic": []})  # light of another wavelength alone comes
-    cube = cubes_of(result, "channels").get(channel)
-    moments = None if cube is None or cube.second_moment is None else cube.second_moment.copy()
-    return replace(
-        result,
-        scene=_behind_analyser(result.scene) if of_polarisation else lines_left_out,
-        tallies=tallies,
-        unit=unit,
-        half=None,
-        second_moment=moments,
-        batch_size=0 if moments is None else result.batch_size,
-        batches=0 if moments is None else result.batches,
-        batch_moments={},
-        reconstruction=None,
-        channel_tallies=None,
-        derivative_tallies=None,
-        provenance={**result.provenance, "channel": channel},
-    )
-
-
-def pixel_channel(result: Result, channel: Channel, row: int, column: int) -> Floats:
-    """`analyser_channel` of one pixel, by component: fraction of the emitted photons, float64 `[3, T]`."""
-    tallies, unit = _channel_tallies(result, channel, (slice(None), row, column))
-    return tallies * (result.tally_value[row, column] * unit / result.unit)
-
-
-def _channel_tallies(result: Result, channel: Channel, at: tuple[Any, ...] = ()) -> tuple[NDArray[np.int64], float]:
-    """Tallies of co- or cross-polarised light, or a part of them, and their unit."""
-    cubes, camera = cubes_of(result, "channels"), result.scene.camera
-    if channel in cubes:
-        return np.maximum(cubes[channel].tallies[at], 0), cubes[channel].unit
-    leak, angle = 1.0 / camera.analyser_extinction_ratio, 2.0 * math.radians(camera.analyser_angle_deg)
-    sign = 1.0 if channel == "co" else -1.0
-    light = (1.0 + leak) * result.tallies[at]
-    for name, share in {"Q": math.cos(angle), "U": math.sin(angle)}.items():
-        light += sign * (1.0 - leak) * share * (cubes[name].unit / result.unit) * cubes[name].tallies[at]
-    # In halves of a unit.
-    return np.rint(np.maximum(light, 0.0)).astype(np.int64), 0.5 * result.unit
-
-
-def degree_of_polarisation(result: Result, *, gated: bool = False) -> Floats:
-    """Part of the light of each pixel and bin that is polarised, float64 `[H, W, T]`; NaN where nothing arrives.
-
-    From four Stokes cubes √(Q² + U² + V²)/I; from co- and cross-polarised light their difference over their sum, which
-    is negative where light across the analyser's angle prevails, without the analyser's own leak. `gated`: of all light
-    in the gate, `[H, W]`. What rounding and noise put beyond 1 is 1.
-
-    Raises `ConfigError` where the result was simulated without channels.
-    """
-    if not result.scene.camera.channels:
-        raise ConfigError(f"the degree of polarisation needs channels; {_CAMERAS}")
-    return _degree(result, _sums(result, (0, 3) if gated else (0,)))
-
-
 def _polarisation_summary(result: Result) -> dict[str, Any]:
     """Light of a result's channels, as fractions of the emitted light, and the degree of polarisation of all of it; of
     a result of one channel its name. Empty without polarised light."""
@@ -835,21 +750,21 @@ def _polarisation_summary(result: Result) -> dict[str, Any]:
         return {"channel": result.provenance["channel"]}
     if not result.channels:
         return {}
-    sums = _sums(result, (0, 1, 2, 3))
+    sums = sums_of(result, (0, 1, 2, 3))
     light = {name: float(total) / result.photons for name, total in sums.items()}
     if not result.scene.camera.channels:
         return {"channels": light}
-    degree = float(_degree(result, sums))
+    degree = float(degree_of(result, sums))
     return {"channels": light, "degree_of_polarisation": degree if math.isfinite(degree) else None}
 
 
-def _sums(result: Result, axes: tuple[int, ...]) -> dict[str, Floats]:
+def sums_of(result: Result, axes: tuple[int, ...]) -> dict[str, Floats]:
     """Channel → its light, times the photons."""
     cubes = cubes_of(result, "channels").items()
     return {name: cube.tallies.sum(axis=axes, dtype=np.float64) * cube.unit for name, cube in cubes}
 
 
-def _degree(result: Result, sums: dict[str, Floats]) -> Floats:
+def degree_of(result: Result, sums: dict[str, Floats]) -> Floats:
     leak = 1.0 / result.scene.camera.analyser_extinction_ratio
     with np.errstate(divide="ignore", invalid="ignore"):
         if "Q" in sums:
@@ -859,10 +774,82 @@ def _degree(result: Result, sums: dict[str, Floats]) -> Floats:
         return degree
 
 
-def _behind_analyser(scene: Scene) -> Scene:
-    """The scene whose camera has no analyser, and as much ambient light as it would pass."""
-    passed = 0.5 * (1.0 + 1.0 / scene.camera.analyser_extinction_ratio)
-    changed = {"camera.polarisation": "none", "detector.ambient_rate": passed * scene.detector.ambient_rate}
-    if scene.daylight is not None:
-        changed["daylight.cloud_factor"] = passed * scene.daylight.cloud_factor
-    return scene.with_overrides(changed)
+# Noise of the simulation against that of a frame
+
+
+def _noise_ratios(result: Result, pixels: NDArray[np.intp]) -> Floats:
+    """`Result.noise_ratio` of pixels, by their numbers in the image; `[P]`."""
+    components, _, _, bins = result.tallies.shape
+    tallies, moments = result.tallies.reshape(components, -1, bins), result.known_moment.reshape(2, -1, bins)
+    size = max(1, _PART_VOXELS // bins)
+    scene, value, better = result.scene, result.tally_value.reshape(-1), result.reconstruction
+    target = np.isfinite(result.truth.depth).reshape(-1)
+    noise = np.broadcast_to(noise_rate(scene, result.truth), (*result.truth.depth.shape, 1)).reshape(-1)
+    ratios = np.full(len(pixels), np.nan)
+    for first in range(0, len(pixels), size):
+        part = pixels[first : first + size]
+        mine = tallies[:, part]
+        scale = (value[part] * (scene.laser.photons_per_pulse * scene.detections_per_photon))[:, None]
+        if better is None:
+            error = result.batch_error(mine, moments[:, part]) * scale
+        else:
+            scale = np.full((1, 1), scene.laser.photons_per_pulse * scene.detections_per_photon)
+            mine = better.histogram.reshape(components, -1, bins)[:, part].astype(np.float64)
+            error = better.error.reshape(-1, bins)[part] * scale
+        light = mine.sum(axis=0) * scale
+        # The return is the light of the target, where there is one.
+        signal = np.where(target[part, None], mine[:2].sum(axis=0) * scale, light)
+        background = noise[part, None] * scene.gate.bin_width
+        ratios[first : first + size] = _ratios(scene, signal, light, background, error)
+    return ratios
+
+
+def _ratios(scene: Scene, signal: Floats, light: Floats, background: Floats, error: Floats) -> Floats:
+    """From detections per pulse `[P, T]`: of the return, of all light, of ambient light and dark counts, and the
+    standard errors of all light.
+
+    The matched filter adds up counts c_k with weights w_k, the return after the instrument's response h. Errors σ_j of
+    the light move it by M² Σ_j σ_j² (Σ_k h_kj w_k S_k)², the photons of M pulses by M (Σ w_k² p_k - (Σ w_k p_k)²) in a
+    first-photon detector, with p_k the probability of a count and S_k that of none until the end of the bin, else by
+    M Σ w_k² λ_k with S_k = 1.
+    """
+    weight, rate = _blurred(scene, signal), _blurred(scene, light) + background
+    if scene.detector.mode == "first_photon":
+        before = np.cumsum(rate, axis=1) - rate
+        counted, none = np.exp(-before) * -np.expm1(-rate), np.exp(-before - rate)
+        variance = (np.square(weight) * counted).sum(axis=1) - np.square((weight * counted).sum(axis=1))
+        moved = weight * none
+    else:
+        variance, moved = (np.square(weight) * rate).sum(axis=1), weight
+    moved = np.square(error * _blurred(scene, moved)).sum(axis=1) * scene.pulses_per_depth_frame
+    return np.divide(moved, variance, out=np.full(len(moved), np.nan), where=variance > 0)
+
+
+def _blurred(scene: Scene, values: Floats) -> Floats:
+    """By a Gaussian response of the width of pulse and jitter, along the bins."""
+    fwhm = math.hypot(scene.laser.pulse_fwhm_ps, scene.detector.jitter_fwhm_ps)
+    sigma = fwhm / (_FWHM_PER_SIGMA * scene.gate.bin_width_ps)
+    if sigma < _NARROW:
+        return values
+    reach = round(3.0 * sigma)  # not `gaussian_filter1d`: SciPy takes longer to load than most commands to run
+    weights = np.exp(-0.5 * np.square(np.arange(-reach, reach + 1) / sigma))
+    padded, bins = np.pad(values, ((0, 0), (reach, reach))), values.shape[1]
+    return sum(weight * padded[:, k : k + bins] for k, weight in enumerate(weights / weights.sum()))
+
+
+class PhotonsNeeded(NamedTuple):
+    """That would bring a result's noise to a goal."""
+
+    photons: float  # in all; infinite where nothing returned yet
+    seconds: float  # that they would take on the devices of the result; NaN where its time is not known
+
+
+def photons_needed(result: Result, noise_ratio: float = NOISE_GOAL) -> PhotonsNeeded:
+    """Photons that would bring `Result.target_noise_ratio` to a goal: it falls as their number.
+
+    `noise_ratio`: the goal, > 0. Where few heavy photons decide, the estimate is too low. Raises `ConfigError` as
+    `Result.noise_ratio` does.
+    """
+    goal = check_real("noise_ratio", noise_ratio, "(0, inf)")
+    photons = result.photons * result.target_noise_ratio / goal
+    return PhotonsNeeded(photons, photons * result.timing.get("trace", math.nan) / result.photons)

@@ -2,16 +2,19 @@
 
 from __future__ import annotations
 
+import itertools
 import operator
+import re
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from typing import Any, TypeVar
+from typing import Any, NamedTuple, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
 
 from spadwarp.scene import Scene
-from spadwarp.values import ConfigError, SpadwarpError
+from spadwarp.scene.flux import FluxArray
+from spadwarp.values import ArgumentError, ConfigError, SpadwarpError, shown
 
 __all__ = ["FluxTallies", "SignedTallies", "Tallies"]
 
@@ -204,6 +207,48 @@ def _shifted(wide: NDArray[np.uint64], shift: np.uint64) -> NDArray[np.uint64]:
     return np.stack([low << shift, high << shift | low >> np.uint64(64) - shift])
 
 
+# Names of derivatives by block of a grid's cells
+
+GRID = "medium.grid."
+_BLOCK_NAME = re.compile(r"medium\.grid\.(\w+)(?:\[(\d+),(\d+),(\d+)\])?")
+
+
+class BlockParameters(NamedTuple):
+    """Coefficients of a grid's cells, block by block: kinds, and number of blocks along the edges of the box."""
+
+    kinds: tuple[str, ...] = ()
+    shape: tuple[int, ...] = (1, 1, 1)
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """Of each block, such as "medium.grid.absorption[0,2,1]"; kind by kind, the last index fastest."""
+        indices = list(itertools.product(*map(range, self.shape)))
+        return tuple(f"{GRID}{kind}[{i},{j},{k}]" for kind in self.kinds for i, j, k in indices)
+
+
+def is_block_name(name: Any) -> bool:
+    """Whether a name is that of a coefficient of the grid's cells, of one block or of all."""
+    return isinstance(name, str) and _BLOCK_NAME.fullmatch(name) is not None
+
+
+def block_parameters(names: Sequence[str]) -> BlockParameters:
+    """Those of full names, of all blocks in their order; other names are left out.
+
+    Raises `ArgumentError` where blocks are missing.
+    """
+    found = [match for match in map(_BLOCK_NAME.fullmatch, names) if match is not None]
+    if not found:
+        return BlockParameters()
+    kinds = tuple(dict.fromkeys(match[1] for match in found))
+    whole = BlockParameters(kinds, tuple(max(int(match[axis] or 0) for match in found) + 1 for axis in (2, 3, 4)))
+    if tuple(match[0] for match in found) != whole.names:
+        raise ArgumentError(
+            f"derivatives: {shown(found[0][0])} ... are not all blocks in their order; ask for {GRID}{kinds[0]} and "
+            "give blocks, the number of them along the edges"
+        )
+    return whole
+
+
 # Photon ids, as [start, stop)
 
 Range = tuple[int, int]
@@ -295,3 +340,31 @@ def photons_per_position(scene: Scene, photon_ranges: Sequence[Range]) -> NDArra
     for start, stop in photon_ranges:  # ids that are the position modulo the number of positions
         photons += (stop - position + positions - 1) // positions - (start - position + positions - 1) // positions
     return np.repeat(np.maximum(photons, 1.0), shape[0] * shape[1] // positions).reshape(shape)
+
+
+# Flux, of all sections one after another
+
+
+def flux_arrays(scene: Scene) -> dict[str, FluxArray]:
+    """Of all sections of a scene, such as "around/fluence", in the order of the tally."""
+    found, first, absorption = dict[str, FluxArray](), 0, scene.medium.range.absorption
+    for section in scene.flux:
+        found |= {f"{section.name}/{name}": array for name, array in section.arrays(absorption, first).items()}
+        first += section.size
+    return found
+
+
+def part_of(entries: NDArray[Any], array: FluxArray) -> NDArray[Any]:
+    """An array of a tally, or of its words: a view."""
+    words = entries.shape[:-1]
+    rows = entries[..., array.entries].reshape(*words, array.shape[0], -1)
+    return rows[..., array.columns].reshape(*words, *array.shape)
+
+
+def check_flux(scene: Scene, tallies: FluxTallies | None, batches: int) -> None:
+    """Refuses tallies that are not those of the scene's sections."""
+    size, moments = sum(section.size for section in scene.flux), None if tallies is None else tallies.second_moment
+    shapes = [None if one is None else one.shape for one in (None if tallies is None else tallies.tallies, moments)]
+    needed = [(size,), (2, size) if batches else None] if scene.flux else [None, None]
+    if shapes != needed:
+        raise ArgumentError(f"flux_tallies and their second moment have the shapes {shapes}; {needed} are needed")

@@ -26,8 +26,8 @@ _Positions = Annotated[tuple[_Position, ...], BeforeValidator(listed)]
 class FluxArray(NamedTuple):
     """An array of a section's tally."""
 
-    first: int  # entry of the whole tally; entries of a row lie together, rows `stride` apart
-    stride: int
+    entries: slice  # those of its section in the whole tally, the rows one after another
+    columns: slice  # its part of each row
     dimensions: dict[str, Coordinate]
     unit: str
     meaning: str
@@ -115,7 +115,7 @@ class Flux(Section):
 
     def arrays(self, absorption: float, first: int = 0) -> dict[str, FluxArray]:
         """Those of its part of the tally, which begins at an entry, by name; `absorption`: the least [1/m]."""
-        unit = 1.0 / self.scale(absorption)
+        unit, entries = 1.0 / self.scale(absorption), slice(first, first + self.size)
         if self.voxels is not None:
             width = self.gate_width_ps
             gates = 0.0 if width is None else self.gate_start_ns * 1e-9 + width * 1e-12 * (np.arange(self.gates) + 0.5)
@@ -126,14 +126,15 @@ class Flux(Section):
                 dimensions[axis] = (centres, "m", f"middle of a voxel in {axis}; 0 without bounds")
             volume = math.prod(edge for edge in self.edges if math.isfinite(edge))
             text = "fluence per emitted photon, times tally units; along edges without bounds its integral"
-            return {"fluence": FluxArray(first, self.size, dimensions, "1/m^2", text, np.array(unit / volume))}
+            value = np.array(unit / volume)
+            return {"fluence": FluxArray(entries, slice(None), dimensions, "1/m^2", text, value)}
         area = math.pi * self.radius**2 if math.isfinite(self.radius) else 1.0
         area_unit = "1" if math.isinf(self.radius) else "1/m^2"
         rows: dict[str, Coordinate] = {"position": (np.array(self.positions), "m", "of a plane along its axis")}
-        stride = self.size // len(self.positions or ())
         text = "irradiance per emitted photon, of planes without bounds what crosses them"
         kinds: Coordinate = (list(IRRADIANCES), "1", "along the axis or against it; of a plane or scalar")
-        found = FluxArray(first, stride, {**rows, "kind": kinds}, area_unit, text, np.array(unit / area))
+        columns = slice(len(IRRADIANCES))
+        found = FluxArray(entries, columns, {**rows, "kind": kinds}, area_unit, text, np.array(unit / area))
         if not self.polar_bins:
             return {"irradiance": found}
         polar, azimuth = (
@@ -144,10 +145,8 @@ class Flux(Section):
             "azimuth": (0.5 * (azimuth[1:] + azimuth[:-1]), "rad", "about the axis, middle of a bin"),
         }
         solid = -np.diff(np.cos(polar))[:, None] * np.diff(azimuth)
-        text = "radiance per emitted photon"
-        radiance = FluxArray(
-            first + len(IRRADIANCES), stride, rows | bins, f"{area_unit}/sr", text, unit / area / solid
-        )
+        columns, text, value = slice(len(IRRADIANCES), None), "radiance per emitted photon", unit / area / solid
+        radiance = FluxArray(entries, columns, rows | bins, f"{area_unit}/sr", text, value)
         return {"irradiance": found, "radiance": radiance}
 
 

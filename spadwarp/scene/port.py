@@ -7,10 +7,9 @@ their own, in float32.
 from __future__ import annotations
 
 import math
-import tomllib
 from collections.abc import Iterator
 from dataclasses import dataclass
-from importlib.resources import files
+from pathlib import Path
 from typing import Any, ClassVar, Literal
 
 import numpy as np
@@ -18,6 +17,7 @@ from numpy.typing import ArrayLike
 from pydantic import Field
 
 from spadwarp.arrays import Floats
+from spadwarp.io.text import read_toml
 from spadwarp.scene.pose import unit_vector, vector_of
 from spadwarp.scene.sections import Direction, Section, Vector, field
 
@@ -25,7 +25,7 @@ from spadwarp.scene.sections import Direction, Section, Vector, field
 _STEPS, _CONVERGED = 30, 1e-9
 
 
-MATERIALS = tomllib.loads((files("spadwarp.scene") / "materials.toml").read_text(encoding="utf-8"))
+MATERIALS = read_toml(Path(__file__).with_name("materials.toml"))
 """Materials of windows."""
 
 

@@ -3,13 +3,10 @@
 from __future__ import annotations
 
 import contextlib
-import csv
-import io
 import math
 import os
 from collections.abc import Iterator
 from dataclasses import dataclass
-from importlib.resources import files
 from pathlib import Path
 from typing import Annotated, Any, Literal, NamedTuple, get_args
 
@@ -18,7 +15,7 @@ from numpy.typing import ArrayLike, NDArray
 from pydantic import BeforeValidator
 
 from spadwarp.io.paths import MESH_ENDINGS, example_or_path, used
-from spadwarp.io.text import read_text, read_toml
+from spadwarp.io.text import csv_lines, read_text, read_toml
 from spadwarp.scene.camera import Camera, to_camera, to_world
 from spadwarp.scene.flux import Flux, Sun
 from spadwarp.scene.laser import Laser, detection_efficiency, spectral_lines
@@ -365,7 +362,7 @@ def load_scene(path: str | os.PathLike[str], overrides: Overrides | None = None)
 
 def template() -> str:
     """The text of a commented scene to start from."""
-    return (files("spadwarp.scene") / "template.toml").read_text(encoding="utf-8")
+    return read_text(Path(__file__).with_name("template.toml"))
 
 
 class WaterLine(NamedTuple):
@@ -490,21 +487,15 @@ def load_trajectory(path: str | os.PathLike[str]) -> Trajectory:
     `laser.position[2]`, `targets[0].translation[2]`. Lines that begin with # are passed over. Raises `FileError` if the
     file cannot be read, `ConfigError` for no such table, a number that is not finite, or times that do not ascend.
     """
-    lines = csv.reader(io.StringIO(read_text(path), newline=""))
-    names: tuple[str, ...] = ()
     rows: list[list[float]] = []
-    try:
+    with csv_lines(path) as lines:
+        names = tuple(cell.strip() for cell in next(lines, [""]))
+        if names[0] != "time" or len(names) < 2:
+            needed = "time and names of fields, such as time,camera.position[0]"
+            raise ValueError(f"{shown(','.join(names))} is not {needed}")
+        if twice := next((name for name in names if names.count(name) > 1), None):
+            raise ValueError(f"{shown(twice)} is there twice")
         for cells in lines:
-            if not cells or cells[0].lstrip().startswith("#"):
-                continue
-            if not names:
-                names = tuple(cell.strip() for cell in cells)
-                if names[0] != "time" or len(names) < 2:
-                    needed = "time and names of fields, such as time,camera.position[0]"
-                    raise ValueError(f"{shown(','.join(names))} is not {needed}")
-                if twice := next((name for name in names if names.count(name) > 1), None):
-                    raise ValueError(f"{shown(twice)} is there twice")
-                continue
             if len(cells) != len(names):
                 raise ValueError(f"{len(cells)} values for {len(names)} names")
             row = [read_real(name, cell, "[-1e19, 1e19]") for name, cell in zip(names, cells, strict=True)]
@@ -515,7 +506,5 @@ def load_trajectory(path: str | os.PathLike[str]) -> Trajectory:
                 raise ValueError(f"more than {_MOST_ROWS} rows")
         if not rows:
             raise ValueError("no row of numbers")
-    except (ValueError, csv.Error) as error:
-        raise ConfigError(f"line {lines.line_num}: {error}", source=str(path)) from None
     table = np.array(rows, np.float64)
     return Trajectory(times=table[:, 0], fields=names[1:], values=table[:, 1:], source=str(Path(path)))

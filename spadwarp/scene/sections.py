@@ -14,13 +14,11 @@ import math
 import os
 import re
 import sys
-import tomllib
 import typing
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from functools import cache
-from importlib.resources import files
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, ClassVar, NamedTuple, Self
 
@@ -31,7 +29,7 @@ from pydantic.fields import FieldInfo
 from pydantic.functional_validators import AfterValidator, BeforeValidator, field_validator, model_validator
 
 from spadwarp.io.paths import sha256
-from spadwarp.io.text import parse_toml, read_columns
+from spadwarp.io.text import parse_toml, read_columns, read_toml
 from spadwarp.values import (
     UNITS,
     ConfigError,
@@ -131,7 +129,7 @@ class Preset:
 
 
 def _read_presets() -> dict[str, dict[str, Preset]]:
-    tables = tomllib.loads((files("spadwarp.scene") / "presets.toml").read_text(encoding="utf-8"))
+    tables = read_toml(Path(__file__).with_name("presets.toml"))
     sources: dict[str, str] = tables.pop("sources")
     found: dict[str, dict[str, Preset]] = {section: {} for section in tables}
     for section, entries in tables.items():

@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-import itertools
 import math
-import re
 from collections.abc import Iterable, Sequence
 from typing import Any, NamedTuple
 
@@ -13,14 +11,12 @@ import warp as wp
 
 import spadwarp_kernels as sk
 from spadwarp.mesh import TriangleMesh
+from spadwarp.result.tallies import GRID, BlockParameters, block_parameters, is_block_name
 from spadwarp.scene import Scene
 from spadwarp.scene.medium import constituent_order, grid_cells
 from spadwarp.values import ArgumentError, ConfigError, shown, suggestion
 
 __all__ = ["derivative_names", "resolve_derivatives"]
-
-_GRID = "medium.grid."
-_BLOCK_NAME = re.compile(r"medium\.grid\.(\w+)(?:\[(\d+),(\d+),(\d+)\])?")
 
 
 class Parameter(NamedTuple):
@@ -71,7 +67,7 @@ def _parameters(scene: Scene) -> dict[str, Parameter]:
         found[name] = Parameter("reflectance", value, problem, target=k)
     found |= _concentrations(scene, everywhere)
     return found | {
-        f"{_GRID}{kind}": Parameter(kind, None, _cells_problem(scene, kind)) for kind in sk.BLOCK_DERIVATIVES
+        f"{GRID}{kind}": Parameter(kind, None, _cells_problem(scene, kind)) for kind in sk.BLOCK_DERIVATIVES
     }
 
 
@@ -133,8 +129,8 @@ def resolve_derivatives(scene: Scene, names: Iterable[str], blocks: Sequence[int
     numbered = [name for name in asked if is_block_name(name) and name.endswith("]")]
     of_blocks = block_parameters(numbered)
     if numbered and blocks is not None:
-        raise ArgumentError(f"blocks need names of all blocks, such as {_GRID}{of_blocks.kinds[0]}")
-    asked = [name for name in asked if name not in numbered] + [f"{_GRID}{kind}" for kind in of_blocks.kinds]
+        raise ArgumentError(f"blocks need names of all blocks, such as {GRID}{of_blocks.kinds[0]}")
+    asked = [name for name in asked if name not in numbered] + [f"{GRID}{kind}" for kind in of_blocks.kinds]
     found = list[str]()
     for name in asked:
         full = _full_name(scene, name, known)
@@ -187,42 +183,6 @@ def _full_name(scene: Scene, name: Any, known: dict[str, Parameter]) -> str:
 
 
 # Blocks of a grid's cells
-
-
-class BlockParameters(NamedTuple):
-    """Coefficients of a grid's cells, block by block: kinds, and number of blocks along the edges of the box."""
-
-    kinds: tuple[str, ...] = ()
-    shape: tuple[int, ...] = (1, 1, 1)
-
-    @property
-    def names(self) -> tuple[str, ...]:
-        """Of each block, such as "medium.grid.absorption[0,2,1]"; kind by kind, the last index fastest."""
-        indices = list(itertools.product(*map(range, self.shape)))
-        return tuple(f"{_GRID}{kind}[{i},{j},{k}]" for kind in self.kinds for i, j, k in indices)
-
-
-def is_block_name(name: Any) -> bool:
-    """Whether a name is that of a coefficient of the grid's cells, of one block or of all."""
-    return isinstance(name, str) and _BLOCK_NAME.fullmatch(name) is not None
-
-
-def block_parameters(names: Sequence[str]) -> BlockParameters:
-    """Those of full names, of all blocks in their order; other names are left out.
-
-    Raises `ArgumentError` where blocks are missing.
-    """
-    found = [match for match in map(_BLOCK_NAME.fullmatch, names) if match is not None]
-    if not found:
-        return BlockParameters()
-    kinds = tuple(dict.fromkeys(match[1] for match in found))
-    whole = BlockParameters(kinds, tuple(max(int(match[axis] or 0) for match in found) + 1 for axis in (2, 3, 4)))
-    if tuple(match[0] for match in found) != whole.names:
-        raise ArgumentError(
-            f"derivatives: {shown(found[0][0])} ... are not all blocks in their order; ask for {_GRID}{kinds[0]} and "
-            "give blocks, the number of them along the edges"
-        )
-    return whole
 
 
 def _block_shape(scene: Scene, blocks: Any) -> tuple[int, ...]:

@@ -16,10 +16,11 @@ import spadwarp_kernels as sk
 from spadwarp.device import pick_device
 from spadwarp.io.hdf5 import PACKED, Coordinate, name_dimensions, read_hdf5, write_hdf5
 from spadwarp.mesh import build_mesh
+from spadwarp.result.tallies import is_block_name
 from spadwarp.scene import Scene, SceneLike, as_scene
 from spadwarp.scene.camera import to_world
 from spadwarp.scene.pose import rotation_matrix
-from spadwarp.transport.derivatives import is_block_name, resolve_derivatives
+from spadwarp.transport.derivatives import resolve_derivatives
 from spadwarp.transport.model import build_model, transport_spec
 from spadwarp.transport.plan import LAUNCH_SIZE
 from spadwarp.transport.simulation import Progress

@@ -21,8 +21,8 @@ from numpy.typing import NDArray
 from spadwarp.device import pick_device, pick_devices, processor_name
 from spadwarp.parallel.workers import Event, Ray, interruptible
 from spadwarp.result import Result, as_result, merge, save_result
-from spadwarp.result.noise import NOISE_GOAL
-from spadwarp.result.result import TARGETS_DIFFER, ResultHead, largest_share, same_targets, unseen_warnings
+from spadwarp.result.file import TARGETS_DIFFER, same_targets
+from spadwarp.result.result import NOISE_GOAL, ResultHead, largest_share, unseen_warnings
 from spadwarp.result.tallies import IdQueue, Range, Ranges, check_capacity, count, joined, without
 from spadwarp.scene import SceneLike, as_scene
 from spadwarp.transport.plan import Plan, RunOptions, make_plan

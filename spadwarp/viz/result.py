@@ -33,8 +33,7 @@ from spadwarp.result import (
     degree_of_polarisation,
     unclear_pixels,
 )
-from spadwarp.result.noise import noise_caption
-from spadwarp.result.result import pixel_channel, pixel_standard_error
+from spadwarp.result.analysis import noise_caption, pixel_channel, pixel_standard_error
 from spadwarp.scene import Medium, Scene
 from spadwarp.scene.sight import lines_of_sight
 from spadwarp.transport import Spectrum, truth_maps

@@ -23,7 +23,7 @@ from spadwarp.frames import FramesFile, InstrumentResponse, detector_response
 from spadwarp.frames.file import SequenceFile
 from spadwarp.io.paths import atomic_path, check_apart
 from spadwarp.result import Channel, Result, analyser_channel
-from spadwarp.result.noise import noise_caption
+from spadwarp.result.analysis import noise_caption
 from spadwarp.scene import Scene
 from spadwarp.scene.sight import lines_of_sight
 from spadwarp.values import ArgumentError, FileError, check_choice, check_integer, check_real, count

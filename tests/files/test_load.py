@@ -34,7 +34,7 @@ def files(tmp_path_factory):
     result.save(folder / "unfinished" / "checkpoint.h5")
     record_frames(result, folder / "counts" / "frames.h5", pulses=500, frames=2, seed=1, device="cpu")
     spadwarp.simulate_analytic(SCENE, frames=3, seed=1, device="cpu").save(folder / "model" / "analytic.h5")
-    save_records(trace(SCENE, photons=100, device="cpu"), folder / "records.h5")
+    save_records(trace(SCENE.with_overrides({"targets": []}), photons=100, device="cpu"), folder / "records.h5")
     make(recipe(), folder / "dataset")
     shard = next((folder / "dataset").glob("frames-*.h5")).name
     inside = {name: name for name in ("run", "unfinished", "dataset")} | {"frames": "counts", "analytic": "model"}

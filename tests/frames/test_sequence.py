@@ -97,6 +97,9 @@ def test_frames_in_between_turn_the_shortest_way(base):
 @pytest.mark.parametrize(
     ("text", "words"),
     [
+        ("tme,camera.position[2]\n0,0\n", "line 1: 'tme,camera.position[2]' is not time and names of fields, such"),
+        ("time,camera.position[2]\n0,0\n1,x\n", "line 3: camera.position[2] = 'x' is not a number"),
+        ("time,camera.position[2]\n1,0\n0,1\n", "line 3: time = 0 is not after 1"),
         ("time,camera.position[0]\n0,0,1\n", "line 2: 3 values for 2 names"),
         ("time,camera.position[0]\n0,nan\n", "camera.position[0]"),
         ("time,camera.position[0],camera.position[0]\n0,0,0\n", "is there twice"),

@@ -17,7 +17,8 @@ from spadwarp.values import ArgumentError, ConfigError
 
 pytestmark = pytest.mark.filterwarnings("ignore:not enough photons")  # few photons
 
-PLANE = {"builtin": "plane", "size": [4.0, 4.0], "translation": [0.0, 0.0, 2.0], "reflectance": 0.5}
+# Of as many faces as the targets of data sets, whose kernel it then has.
+PLANE = {"builtin": "plane", "size": [4.0, 4.0], "translation": [0.0, 0.0, 2.0], "reflectance": 0.5, "subdivisions": 3}
 
 
 def polarised(camera="analyser", **fields):

@@ -73,14 +73,23 @@ def test_the_view_holds_every_pixel_and_little_more(lens):
     assert (inside > views[row, column, :2]).all() and (inside < views[row, column, 2:]).all()
 
 
-def test_without_intrinsics_the_axis_is_in_the_middle():
-    camera = Camera(width=40, height=30, horizontal_fov_deg=2 * math.degrees(math.atan(0.2)), aperture_diameter=0.01)
-    same = Camera(width=40, height=30, fx=100.0, cx=19.5, cy=14.5, aperture_diameter=0.01)
-    assert camera.is_plain and Camera(width=40, height=30, fx=100.0, aperture_diameter=0.01).is_plain
-    assert same.focal_pixels == pytest.approx(camera.focal_pixels)
-    assert same.principal_point == camera.principal_point == (20.0, 15.0)
-    np.testing.assert_allclose(pixel_directions(same), pixel_directions(camera), rtol=1e-14)
-    shifted = Camera(width=40, height=30, fx=100.0, cx=0.0, cy=0.0, aperture_diameter=0.01)
+def test_all_ways_to_give_a_camera_agree():
+    image = {"width": 40, "height": 30}
+    ways = (
+        {"horizontal_fov_deg": 2 * math.degrees(math.atan(0.2))},
+        {"fx": 100.0},
+        {"fx": 100.0, "cx": 19.5, "cy": 14.5},
+    )
+    cameras = [Camera(**image, **way, aperture_diameter=0.005) for way in ways]
+    cameras.append(Camera(**image, focal_length=0.01, pixel_pitch_um=100.0, f_number=2.0))
+    for camera in cameras:
+        assert camera.is_plain and camera.pixel_tangent == pytest.approx(0.01)
+        assert camera.aperture_radius == pytest.approx(0.0025)
+        assert camera.focal_pixels == pytest.approx((100.0, 100.0)) and camera.principal_point == (20.0, 15.0)
+        half = math.tan(camera.horizontal_fov / 2), math.tan(camera.vertical_fov / 2)
+        assert half == pytest.approx((0.2, 0.15))
+        np.testing.assert_allclose(pixel_directions(camera), pixel_directions(cameras[0]), rtol=1e-14)
+    shifted = Camera(**image, fx=100.0, cx=0.0, cy=0.0, aperture_diameter=0.01)
     np.testing.assert_array_equal(pixel_directions(shifted)[0, 0], [0.0, 0.0, 1.0])
     assert shifted.horizontal_fov == pytest.approx(math.atan(0.395) + math.atan(0.005))
 

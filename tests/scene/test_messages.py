@@ -178,21 +178,6 @@ def test_files_that_are_no_scene_are_named(name, content, error, text, tmp_path)
     assert text in str(caught.value)
 
 
-@pytest.mark.parametrize(
-    ("table", "text"),
-    [
-        ("tme,camera.position[2]\n0,0\n", "line 1: 'tme,camera.position[2]' is not time and names of fields, such"),
-        ("time,camera.position[2]\n0,0\n1,x\n", "line 3: camera.position[2] = 'x' is not a number"),
-        ("time,camera.position[2]\n1,0\n0,1\n", "line 3: time = 0 is not after 1"),
-    ],
-)
-def test_trajectories(table, text, tmp_path):
-    (tmp_path / "poses.csv").write_text(table)
-    with pytest.raises(ConfigError) as caught:
-        spadwarp.scene.load_trajectory(tmp_path / "poses.csv")
-    assert text in str(caught.value)
-
-
 def nested(depth):
     value = []
     for _ in range(depth):

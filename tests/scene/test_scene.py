@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 from helpers.minimal_scene import problems, scene
 from spadwarp.dataset.recipe import Recipe
 from spadwarp.denoise.recipe import TrainingRecipe
-from spadwarp.scene import Camera, Medium, Scene, parse_override, presets
+from spadwarp.scene import Medium, Scene, parse_override, presets
 from spadwarp.scene.medium import Constituent
 from spadwarp.scene.sections import interval_of, models_of, parts_of
 from spadwarp.values import SPEED_OF_LIGHT, ConfigError
@@ -160,16 +160,6 @@ def test_derived_quantities():
     assert one.laser.half_angle == pytest.approx(math.pi / 12)
     assert one.detector.pde == pytest.approx(0.05)
     assert one.camera.aperture_area == pytest.approx(math.pi * 0.005**2)
-
-
-def test_both_ways_to_give_a_camera_agree():
-    by_angle = Camera(width=40, height=30, horizontal_fov_deg=2 * math.degrees(math.atan(0.2)), aperture_diameter=0.005)
-    by_lens = Camera(width=40, height=30, focal_length=0.01, pixel_pitch_um=100.0, f_number=2.0)
-    for camera in (by_angle, by_lens):
-        assert camera.pixel_tangent == pytest.approx(0.01)
-        assert camera.aperture_radius == pytest.approx(0.0025)
-        assert math.tan(camera.horizontal_fov / 2) == pytest.approx(0.2)
-        assert math.tan(camera.vertical_fov / 2) == pytest.approx(0.15)
 
 
 def number_fields(model, path=""):
