@@ -16,6 +16,7 @@ from itertools import accumulate
 from typing import Any, Literal
 
 import numpy as np
+import warp as wp
 from numpy.typing import NDArray
 
 from spadwarp.device import pick_device, pick_devices, processor_name
@@ -33,6 +34,7 @@ from spadwarp.values import (
     DeviceError,
     FileError,
     SpadwarpWarning,
+    __version__,
     check_real,
     percent,
     shown,
@@ -421,10 +423,6 @@ class StoppingRule:
 
 def provenance(device: Any = None) -> dict[str, Any]:
     """What made a result: versions, machine, date; and a device."""
-    import warp as wp
-
-    from spadwarp.values import __version__
-
     made = {
         "spadwarp": __version__,
         "warp": wp.__version__,
