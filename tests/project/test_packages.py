@@ -110,8 +110,8 @@ def test_one_line_methods_have_one_line():
 # Lines of `*.py`: what a package is to come to, and what it has. What it has may only fall; a feature that needs more
 # lines deletes as many, or brings its own with a reason.
 LINES = {
-    "spadwarp": (750, 1433),
-    "analytic": (2000, 2513),
+    "spadwarp": (750, 1441),
+    "analytic": (2000, 2492),
     "benchmark": (500, 505),
     "checks": (800, 900),
     "cli": (2900, 3079),
@@ -120,15 +120,15 @@ LINES = {
     "evaluation": (1600, 1598),
     "files": (1150, 1422),
     "frames": (2500, 2959),
-    "inverse": (1900, 2312),
+    "inverse": (1900, 2303),
     "io": (1200, 1480),
     "mesh": (1800, 1820),
     "parallel": (600, 566),
     "result": (1500, 2119),
     "scene": (3700, 5229),
-    "transport": (2300, 3462),
+    "transport": (2300, 3445),
     "validate": (750, 794),
-    "viz": (2200, 2548),
+    "viz": (2200, 2542),
     "water": (800, 848),
     "kernels/spadwarp_kernels": (50, 50),
     "kernels/analytic": (1650, 1676),
@@ -142,7 +142,7 @@ LINES = {
     "kernels/tally": (450, 1032),
     "kernels/transport": (1450, 1662),
     "kernels/water": (1350, 1518),
-    "kernels/worlds": (1600, 2156),
+    "kernels/worlds": (1600, 2154),
 }
 
 
