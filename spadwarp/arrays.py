@@ -27,6 +27,14 @@ if TYPE_CHECKING:
     import xarray
 
 
+def block_sums(cube: NDArray[Any], sizes: tuple[int, int, int]) -> NDArray[Any]:
+    """Sums over blocks of so many entries along each axis; blocks at the ends may be smaller."""
+    for axis in (2, 1, 0):
+        if sizes[axis] > 1:
+            cube = np.add.reduceat(cube, np.arange(0, cube.shape[axis], sizes[axis]), axis=axis)
+    return cube
+
+
 def as_warp(array: Any, *, name: str, device: Any = None) -> Any:
     """A contiguous Warp array of int32, int64, float32 or float64 from NumPy, torch or Warp; copies only if it must.
 

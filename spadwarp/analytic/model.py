@@ -18,8 +18,10 @@ import warnings
 from typing import Any, NamedTuple
 
 import numpy as np
+import warp as wp
 from numpy.typing import ArrayLike, NDArray
 
+import spadwarp_kernels as sk
 from spadwarp.device import pick_device
 from spadwarp.frames.response import FWHM_PER_SIGMA
 from spadwarp.scene import Scene, daylight_rate, phase_function, water_lines
@@ -88,8 +90,6 @@ def pixel_maps(
     Returns float64 maps `[P]`, `daylight` [1/s] among them, and the table. Raises `ConfigError`: a scene that the model
     does not cover; `ArgumentError`: the scene's backscatter needs a profile.
     """
-    from spadwarp_kernels import analytic as kernels
-
     start, stop = gate or (scene.gate.start, scene.gate.stop)
     views = np.ascontiguousarray(view, np.float64)
     distances = np.nan_to_num(np.asarray(distance, np.float64), nan=0.0)
@@ -102,7 +102,7 @@ def pixel_maps(
     ambient = daylight_rate(
         scene, view=views, distance=distances, normal=np.asarray(normal), reflectance=np.asarray(reflectance)
     )
-    statistics = kernels.statistics_maps(
+    statistics = sk.statistics_maps(
         model.lidar,
         model.phase,
         model.on_device(profile, np.float32),
@@ -155,10 +155,8 @@ def scene_optics(scene: Scene) -> tuple[Any, Any]:
 
     Raises `ConfigError` for a lens or a laser that reaches through its port.
     """
-    from spadwarp_kernels import analytic as kernels
-
     camera, laser = camera_port(scene), laser_port(scene)
-    ports: Any = kernels.Ports()
+    ports: Any = sk.Ports()
     if camera is not None:
         radius = 0.0 if scene.camera.pinhole else scene.camera.aperture_radius
         ports.camera = port_parameters(scene, camera, (0.0, 0.0, 0.0), radius, 0.0)
@@ -166,19 +164,15 @@ def scene_optics(scene: Scene) -> tuple[Any, Any]:
         ports.laser = port_parameters(scene, laser, scene.beam.position, 0.0, 0.0)
     slope = 0.0 if scene.surface is None else math.sqrt(0.5 * sum(scene.surface.slope_variances))
     ports.slope = slope
-    return kernels.make_optics(port_kind(camera), port_kind(laser), rough=slope > 0.0), ports
+    return sk.make_optics(port_kind(camera), port_kind(laser), rough=slope > 0.0), ports
 
 
 def false_peaks(signal: ArrayLike, level: ArrayLike, lengths: ArrayLike, device: Any = None) -> Map:
     """Probability that a maximum-likelihood fit takes background for the return: from recorded photons of the return,
     and of background per standard deviation of the response, and the gate's length in these."""
-    import warp as wp
-
-    from spadwarp_kernels.analytic import outlier_probabilities
-
     target, columns = pick_device(device), (signal, level, lengths)
     arrays: list[Any] = [wp.array(np.nan_to_num(column), dtype=wp.float64, device=target) for column in columns]
-    return outlier_probabilities(*arrays).numpy()
+    return sk.outlier_probabilities(*arrays).numpy()
 
 
 class _Model:
@@ -202,8 +196,6 @@ class _Model:
 
     def on_device(self, values: ArrayLike, kind: Any = np.float64, *, nan: float = 0.0) -> Any:
         """An array of numbers `[P]` or vectors `[P, 3]` in the device's memory."""
-        import warp as wp
-
         rows = np.nan_to_num(np.ascontiguousarray(values, kind), nan=nan)
         dtype: Any = wp.float32 if kind is np.float32 else wp.vec3d if rows.shape[1:] == (3,) else wp.float64
         return wp.array(rows, dtype=dtype, device=self.device)
@@ -215,14 +207,12 @@ class _Model:
 
     def signal(self, normal: ArrayLike, reflectance: ArrayLike) -> tuple[Map, Map]:
         """S, summed over the lines, and the mean arrival time of their photons, `[P]`."""
-        from spadwarp_kernels import analytic as kernels
-
         lidar, surfaces = self.lidar, [*self.sights, self.on_device(normal), self.on_device(reflectance)]
         whole = (lidar.photons, lidar.extinction, lidar.speed)
         parts: list[tuple[Map, Map]] = []
         for line in self.lines:
             lidar.photons, lidar.extinction, lidar.speed = whole[0] * line.share, line.extinction, line.speed
-            signal, arrival = kernels.signal_map(lidar, *surfaces, optics=self.optics)
+            signal, arrival = sk.signal_map(lidar, *surfaces, optics=self.optics)
             parts.append((signal.numpy(), arrival.numpy()))
         lidar.photons, lidar.extinction, lidar.speed = whole
         if len(parts) == 1:
@@ -234,9 +224,6 @@ class _Model:
 
     def backscatter(self, profile: NDArray[np.float32] | None) -> tuple[Map, BackscatterTable, NDArray[np.float32]]:
         """Detections per pulse in the gate, their table, and their profile if the model takes one."""
-        from spadwarp_kernels import BACKSCATTER_SOURCES
-        from spadwarp_kernels import analytic as kernels
-
         lidar, chosen, speed = self.lidar, self.scene.analytic, self.scene.medium.pulse_speed
         gate, empty = (lidar.start, lidar.stop), np.zeros((1, 1), np.float32)
         if chosen.backscatter == "constant":
@@ -247,12 +234,12 @@ class _Model:
             # Through cells, the table of water that scatters 1/m, times what the cells do.
             by_cells = self.scene.medium.grid is not None
             rows = self.line_rows([1.0 if by_cells else line.scattering for line in self.lines])
-            table = kernels.single_scatter_table(lidar, self.phase, *self.sights, lines=rows, optics=self.optics)
+            table = sk.single_scatter_table(lidar, self.phase, *self.sights, lines=rows, optics=self.optics)
             paths, cumulative, total = (part.numpy() for part in table)
             if not by_cells:
                 return total, BackscatterTable(paths, cumulative), empty
             profile = grid_backscatter(self.scene, self.sights[0].numpy(), paths, cumulative, total, gate)
-            lidar.source = BACKSCATTER_SOURCES.index("monte_carlo")
+            lidar.source = sk.BACKSCATTER_SOURCES.index("monte_carlo")
         elif profile is None:
             raise ArgumentError("backscatter_profile is missing; analytic.backscatter = 'monte_carlo' needs it")
         sums = np.concatenate([np.zeros((len(profile), 1)), np.cumsum(profile, axis=1, dtype=np.float64)], axis=1)
@@ -294,12 +281,8 @@ def _not_covered(scene: Scene) -> dict[str, bool]:
 
 def _lidar(scene: Scene, start: float, stop: float) -> tuple[Any, Any]:
     """The scene and its optics as the kernels take it."""
-    import warp as wp
-
-    from spadwarp_kernels import BACKSCATTER_SOURCES, LASER_PROFILES, Lidar
-
     laser, camera, chosen = scene.beam, scene.camera, scene.analytic
-    lidar: Any = Lidar()
+    lidar: Any = sk.Lidar()
     lidar.lu2024 = int(chosen.form == "lu2024")
     lidar.photons = laser.photons_per_pulse
     lidar.pde = scene.detector.pde
@@ -308,7 +291,7 @@ def _lidar(scene: Scene, start: float, stop: float) -> tuple[Any, Any]:
     lidar.speed = scene.medium.pulse_speed
     lidar.laser = wp.vec3d(*laser.position)
     lidar.axis = wp.vec3d(*laser.axis)
-    lidar.profile = LASER_PROFILES.index(laser.profile)
+    lidar.profile = sk.LASER_PROFILES.index(laser.profile)
     lidar.spread = 2.0 * math.sin(0.5 * laser.half_angle) ** 2
     lidar.tan2 = math.tan(min(laser.half_angle, math.radians(89.9))) ** 2
     lidar.radius = laser.beam_radius
@@ -318,7 +301,7 @@ def _lidar(scene: Scene, start: float, stop: float) -> tuple[Any, Any]:
     lidar.stop = stop
     lidar.sigma = response_sigma(scene)
     lidar.dark = scene.detector.noise_rate
-    lidar.source = BACKSCATTER_SOURCES.index(chosen.backscatter)
+    lidar.source = sk.BACKSCATTER_SOURCES.index(chosen.backscatter)
     lidar.constant = chosen.backscatter_rate
     # Nearer than its own diameter the aperture's solid angle is not area over distance squared.
     lidar.nearest = 2.0 * camera.aperture_radius

@@ -8,8 +8,10 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, Self
 
 import numpy as np
+import warp as wp
 from numpy.typing import ArrayLike, NDArray
 
+import spadwarp_kernels as sk
 from spadwarp.analytic.model import BackscatterTable, Map, pixel_maps, response_sigma, scene_optics, warn_of_model
 from spadwarp.arrays import labelled, real_array
 from spadwarp.device import pick_device
@@ -20,7 +22,7 @@ from spadwarp.scene import Scene, SceneLike, as_scene
 from spadwarp.scene.camera import pixel_directions
 from spadwarp.scene.sight import gate_deviation, lines_of_sight
 from spadwarp.transport import truth_maps
-from spadwarp.values import SEED, ArgumentError, ConfigError, Interval, Shown, check_integer
+from spadwarp.values import SEED, ArgumentError, ConfigError, Interval, Shown, __version__, check_integer
 
 if TYPE_CHECKING:
     import xarray
@@ -111,10 +113,6 @@ class AnalyticResult(Shown):
 
         A frame depends on seed and number alone, so they can be drawn in parts. `seed`: the result's if not given.
         """
-        import warp as wp
-
-        from spadwarp_kernels import analytic as kernels
-
         device = pick_device(device)
         shape, pixels = self.truth.depth.shape, self.truth.depth.size
         optics, ports = scene_optics(self.scene)
@@ -132,7 +130,7 @@ class AnalyticResult(Shown):
         part = max(_PART_PIXELS // pixels, 2)
         for start in range(0, frames, part):
             number = min(part, frames - start)
-            drawn = kernels.sample_frames(
+            drawn = sk.sample_frames(
                 *inputs,
                 laser=self.scene.beam.position,
                 optics=optics,
@@ -172,8 +170,6 @@ class AnalyticResult(Shown):
 
         Raises `FileError`: the file cannot be written.
         """
-        from spadwarp.values import __version__
-
         if frames is not None:
             frames = check_integer("frames", frames, "[0, 2147483647]")
         count, shape, scene = len(self.depth) if frames is None else frames, self.truth.depth.shape, self.scene

@@ -18,7 +18,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from spadwarp.arrays import Floats
+from spadwarp.arrays import Floats, block_sums
 from spadwarp.device import core_count
 from spadwarp.inverse.rendering import Half
 from spadwarp.inverse.unknowns import DEPTH, Unknown
@@ -166,11 +166,11 @@ class Moments:
         slopes: Rows = np.mean(scored, axis=0) if len(scored) > 1 else scored[0]
         mean: Rows = np.mean(self.batches[number][: len(scored)], axis=0)
         variance = self.law.variance(mean, self.trials)
-        below = {cell: _in_cells(variance, self.image, cell) for cell in set(cells)}
+        below = {cell: block_sums(variance.reshape(*self.image, -1), cell) for cell in set(cells)}
         weights = np.empty_like(slopes)
 
         def unknown(i: int) -> None:
-            under, above = below[cells[i]], _in_cells(slopes[:, i], self.image, cells[i])
+            under, above = below[cells[i]], block_sums(slopes[:, i].reshape(*self.image, -1), cells[i])
             weight = np.divide(above, under, out=np.zeros_like(above), where=under > 0)
             np.clip(weight, -limits[i], limits[i], out=weight)
             weights[:, i] = _expanded(weight, self.image, cells[i], slopes.shape[2])
@@ -186,15 +186,6 @@ def _in_threads(work: Callable[[Any], None], items: Sequence[Any]) -> None:
 
 def _parts(pixels: int) -> list[slice]:
     return [slice(first, min(first + _PIXELS, pixels)) for first in range(0, pixels, _PIXELS)]
-
-
-def _in_cells(rows: Rows, image: tuple[int, int], cell: Cell) -> Rows:
-    """Sums over cells, `[row, column, bin]` of cells."""
-    cube = rows.reshape(*image, -1)
-    for axis in (2, 1, 0):
-        if cell[axis] > 1:
-            cube = np.add.reduceat(cube, np.arange(0, cube.shape[axis], cell[axis]), axis=axis)
-    return cube
 
 
 def _expanded(cube: Rows, image: tuple[int, int], cell: Cell, bins: int) -> Rows:

@@ -16,6 +16,7 @@ from itertools import accumulate
 from typing import Any, Literal
 
 import numpy as np
+import warp as wp
 from numpy.typing import NDArray
 
 from spadwarp.device import pick_device, pick_devices, processor_name
@@ -33,6 +34,7 @@ from spadwarp.values import (
     DeviceError,
     FileError,
     SpadwarpWarning,
+    __version__,
     check_real,
     percent,
     shown,
@@ -55,7 +57,7 @@ _LARGEST_SHARE = 0.02
 
 DEFAULT_TIME = 60.0
 """Seconds of a run whose error decides its photons."""
-_LEAST_PART = 0.05  # of the photons, for which such a run goes on
+_LEAST_PART = 0.05  # of the time so far, for which such a run goes on
 
 FIRST_LOOK = 32
 """Batches after which a run whose goal is a relative error first looks at it."""
@@ -242,47 +244,37 @@ class _Run:
     def _known_result(self, rule: StoppingRule, seconds: float) -> Result:
         """Traces until the error is known to be small enough, looking at it where it may be, or for so many seconds."""
         size, (start, stop), began = self._plan.batch_size, self._plan.requested, time.monotonic()
-        earlier, spent = count(self._earlier), 0.0
-        if limited := seconds < math.inf:  # and it first finds out how fast it is
-            end = min(start + earlier + 2 * len(self._workers.workers) * size, stop)
-        else:
-            end = min(start + max(FIRST_LOOK * size, earlier), stop)
-        self._photons = max(earlier + FIRST_LOOK * size, end - start) + size
+        earlier, deadline, limited = count(self._earlier), began + seconds, seconds < math.inf
+        end = min(start + max(FIRST_LOOK * size, earlier), stop)
+        self._photons = end - start + size
         while True:
-            launched = time.monotonic()
-            self._trace((start, end))
-            spent += time.monotonic() - launched
+            self._trace((start, end), deadline)
             if not self._done and self._stopped.is_set():
                 raise KeyboardInterrupt
             result = self._collect()
-            if self._stopped.is_set() and without((start, end), joined(result.photon_ranges)):
+            ids, now = joined(result.photon_ranges), time.monotonic()
+            if self._stopped.is_set() and without((start, end), ids):
                 return result
-            batches, left, needed = result.photons // size, stop - end, math.inf
-            wanted: int | None = max(FIRST_LOOK, 2 * batches)
-            if not limited or batches >= FIRST_LOOK:
-                error = rule.error_of(result)
-                wanted = rule.next_look(batches, error, partial(largest_share, result))
-                needed = result.photons * (error / rule.goal) ** 2
-                text = f"error {100 * error:.3g} %" if rule.is_relative else f"noise ratio {error * error:.3g}"
-                text += f" after {result.batches} batches"
-                text += f"; about {needed:.2g} photons are needed" if rule.goal < error < math.inf else ""
-                self._report(text, result.photons, self._photons)
-                left = 0 if wanted is None else left
-            if limited:
-                rate = (result.photons - earlier) / spent
-                left = min(left, int(rate * (seconds - (time.monotonic() - began))))
-                left = left if left >= _LEAST_PART * result.photons else 0
-            if left < 1:
+            error, batches = rule.error_of(result), result.photons // size
+            wanted = rule.next_look(batches, error, partial(largest_share, result))
+            needed = result.photons * (error / rule.goal) ** 2
+            text = f"error {100 * error:.3g} %" if rule.is_relative else f"noise ratio {error * error:.3g}"
+            text += f" after {result.batches} batches"
+            text += f"; about {needed:.2g} photons are needed" if rule.goal < error < math.inf else ""
+            self._report(text, result.photons, self._photons)
+            if wanted is None or result.photons >= stop - start or deadline - now < _LEAST_PART * (now - began):
                 self._report("trace", result.photons, result.photons)
-                return replace(result, requested=(start, end), partial=False)
-            assert wanted is not None
-            more = wanted - batches
-            end += min(more * size, max(left // size, 1) * size if limited else left)
+                end = ids[-1][1]
+                return replace(result, requested=(start, end), partial=bool(without((start, end), ids)))
+            end = min(end + (wanted - batches) * size, stop)
             # Of the error's own: what is done of the photons that reach the goal, or that the time allows.
-            self._photons = max(int(min(result.photons + left, needed)), end - start + (0 if rule.found else size))
+            most = min(needed, stop - start)
+            if limited:
+                most = min(most, result.photons + (result.photons - earlier) * (deadline - now) / (now - began))
+            self._photons = max(int(most), end - start + (0 if rule.found else size))
 
-    def _trace(self, span: Range) -> None:
-        """Traces the ids of a span that are not done; fewer where the run is stopped."""
+    def _trace(self, span: Range, deadline: float = math.inf) -> None:
+        """Traces the ids of a span that are not done; fewer where the run is stopped, or the time is over."""
         self._waiting = IdQueue(without(span, joined([*self._earlier, *self._done])))
         stop_sent = False
         try:
@@ -290,12 +282,14 @@ class _Run:
                 if self._stopped.is_set() and not stop_sent:
                     self._workers.stop()
                     stop_sent = True
+                if time.monotonic() >= deadline and (self._done or self._held or self._running):
+                    self._waiting = IdQueue(())
                 ending = stop_sent or not self._unfinished()
                 pause = math.inf if self._place is None else max(self._every, self._cost / _LARGEST_SHARE)
                 if self._collecting is None and not ending and time.monotonic() >= self._written + pause:
                     # None again if no worker has done or begun anything yet.
                     self._collecting = {*self._held, *self._running} or None
-                self._assign(ending, stop_sent)
+                self._assign(ending, stop_sent, deadline)
                 if ending and not self._running:
                     return
                 for event in self._workers.wait():
@@ -313,7 +307,7 @@ class _Run:
     def _unfinished(self) -> bool:
         return bool(self._waiting.left or any(self._running.values()))
 
-    def _assign(self, ending: bool, stopped: bool) -> None:
+    def _assign(self, ending: bool, stopped: bool, deadline: float) -> None:
         """Gives every idle worker something to do."""
         idle: Sequence[Any] = self._workers.idle
         for worker in idle:
@@ -322,14 +316,15 @@ class _Run:
                 self._workers.collect(worker)
             elif stopped or (self._collecting is not None and self._workers.must_rest):
                 continue
-            elif block := self._waiting.take(self._size(worker), self._plan.batch_size or 1):
+            elif block := self._waiting.take(self._size(worker, deadline), self._plan.batch_size or 1):
                 self._running[worker] = block
                 self._workers.send(worker, trace_block, block)
 
-    def _size(self, worker: Any) -> int:
+    def _size(self, worker: Any, deadline: float) -> int:
         """Photons of the next block: some seconds, fewer towards the end so that all workers end together."""
         first, workers, unit = self._workers.first_block, len(self._workers.workers), self._plan.batch_size or 1
-        size = int(self._speed[worker] * _BLOCK_SECONDS) if worker in self._speed else first
+        seconds = min(_BLOCK_SECONDS, max(deadline - time.monotonic(), 0.0))
+        size = int(self._speed[worker] * seconds) if worker in self._speed else first
         if workers > 1:
             size = min(size, max(self._waiting.left // (2 * workers), first // 16))
         return -(-size // unit) * unit
@@ -428,10 +423,6 @@ class StoppingRule:
 
 def provenance(device: Any = None) -> dict[str, Any]:
     """What made a result: versions, machine, date; and a device."""
-    import warp as wp
-
-    from spadwarp.values import __version__
-
     made = {
         "spadwarp": __version__,
         "warp": wp.__version__,

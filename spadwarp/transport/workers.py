@@ -536,7 +536,9 @@ class ClusterWorkers(RayWorkers):
         size += 24 * sum(section.size for section in plan.scene.flux)
         super().__init__(engine, device, prepare=functools.partial(_prepare, plan), value_bytes=size, note=note)
         self._total: Tallies | None = None
-        self.timing: dict[str, float] = {}
+        began = time.perf_counter()
+        self.truth = trace_truth(plan.scene, build_model(plan.scene, pick_device("cpu"), plan.mesh, camera=False))
+        self.timing = {"truth": time.perf_counter() - began}
 
     def __enter__(self) -> ClusterWorkers:
         began = time.perf_counter()
@@ -544,26 +546,13 @@ class ClusterWorkers(RayWorkers):
         self.first_block = _FIRST_BLOCK["cuda" if self.cuda else "cpu"]
         started = time.perf_counter()
         try:
-            self.truth = self._truth()
+            while not self.idle:  # until a worker has joined
+                self.wait()
         except BaseException:
             self.__exit__()
             raise
-        self.timing = {"setup": started - began, "compile": self._joined - started}
-        self.timing["truth"] = time.perf_counter() - self._joined
+        self.timing |= {"setup": started - began, "compile": time.perf_counter() - started}
         return self
-
-    def _truth(self) -> Truth:
-        """By the first worker that has joined, which also waits for it."""
-        while not self.idle:
-            self.wait()
-        self._joined = time.perf_counter()
-        self.send(self.idle[0], _truth)
-        while True:
-            for event in self.wait():
-                if event.kind == "returned":
-                    return event.value
-                if event.kind == "lost":
-                    return self._truth()
 
     def collect(self, worker: Any) -> None:
         """Lets an idle worker begin to hand its tallies over."""
@@ -594,11 +583,7 @@ class ClusterWorkers(RayWorkers):
 def _prepare(plan: Plan, worker: Worker) -> None:
     """Run first by a worker of Ray, which then has the device of `LocalWorkers`."""
     local = LocalWorkers(plan, [pick_device(worker.device)], threads=worker.threads)
-    worker.state |= {"tracer": local.tracers[0], "truth": local.truth, "report": lambda photons: None}
-
-
-def _truth(worker: Worker) -> Truth:
-    return worker.state["truth"]
+    worker.state |= {"tracer": local.tracers[0], "report": lambda photons: None}
 
 
 def trace_block(block: Range, worker: Worker) -> tuple[Ranges, float]:

@@ -17,6 +17,7 @@ from matplotlib.colors import Colormap, LogNorm, Normalize
 from matplotlib.image import AxesImage
 from numpy.typing import NDArray
 
+from spadwarp.arrays import block_sums
 from spadwarp.files import Held, load, sequence
 from spadwarp.files.formats import FrameSequence
 from spadwarp.frames import FramesFile, InstrumentResponse, detector_response
@@ -255,21 +256,14 @@ def _histograms(layers: list[dict[str, Any]]) -> tuple[list[dict[str, Any]], int
     """The layers, packed within `HISTOGRAM_BYTES`; the side of a block of pixels; bins that were merged."""
     for block, merged in _STEPS:
         rows = max(layers[0]["cube"].shape[0] // 16, block) // block * block
-        trial = sum(len(_pack(_reduced(layer["cube"][:rows], block, merged), layer)["codes"]) for layer in layers)
+        sizes = block, block, merged
+        trial = sum(len(_pack(block_sums(layer["cube"][:rows], sizes), layer)["codes"]) for layer in layers)
         if trial * layers[0]["cube"].shape[0] / rows > 1.5 * HISTOGRAM_BYTES:
             continue  # far too large, as a part of the rows shows
-        packed = [_pack(_reduced(layer["cube"], block, merged), layer) for layer in layers]
+        packed = [_pack(block_sums(layer["cube"], sizes), layer) for layer in layers]
         if sum(len(layer["codes"]) for layer in packed) <= HISTOGRAM_BYTES / 3 * 4:
             break
     return packed, block, merged
-
-
-def _reduced(cube: NDArray[Any], block: int, merged: int) -> NDArray[Any]:
-    """Sums over blocks of pixels and bins; those at the ends may be smaller."""
-    for axis, step in ((2, merged), (1, block), (0, block)):
-        if step > 1:
-            cube = np.add.reduceat(cube, np.arange(0, cube.shape[axis], step), axis=axis)
-    return cube
 
 
 def _pack(values: NDArray[Any], layer: dict[str, Any]) -> dict[str, Any]:
@@ -370,7 +364,7 @@ def video(
         kept = _window(cube, edges, window_ns)
         cube, edges = cube[:, :, kept], edges[kept.start : kept.stop + 1]
         merged = -(-cube.shape[2] // pictures)
-        cube, edges = _reduced(cube, 1, merged), np.append(edges[:-1:merged], edges[-1])
+        cube, edges = block_sums(cube, (1, 1, merged)), np.append(edges[:-1:merged], edges[-1])
         label += " and picture" if merged > 1 else " and bin"
         drawn = _of_light(cube, edges, label, metres_per_ns, scale, sides)
     with atomic_path(path) as temporary:

@@ -10,14 +10,7 @@ import math
 
 import numpy as np
 
-
-def fresnel(cosine, index):
-    """Reflectance of unpolarised light in water of an index below air."""
-    sine2 = index**2 * (1.0 - cosine**2)
-    behind = np.sqrt(np.maximum(1.0 - sine2, 0.0))
-    s = (index * cosine - behind) / (index * cosine + behind)
-    p = (cosine - index * behind) / (cosine + index * behind)
-    return np.where(sine2 >= 1.0, 1.0, 0.5 * (s**2 + p**2))
+from reference.refraction import reflectance
 
 
 def rayleigh(theta):
@@ -65,7 +58,7 @@ def irradiance(absorption, scattering, phase, depths, *, zenith_deg=60.0, index=
     same, opposite = redistribution(mu, 1.0), redistribution(mu, -1.0)
     # What the nodes miss of the light of one of them goes on as it came.
     same[np.diag_indices_from(same)] += (2.0 - weight @ (same + opposite)) / weight
-    beam = (1.0 - fresnel(sun, index)) / sun  # irradiance across it
+    beam = (1.0 - reflectance(sun, 1.0 / index)) / sun  # irradiance across it
     first = [redistribution(np.array([sun]), side)[:, 0] for side in (1.0, -1.0)]
     found = 2.0 / (weight @ sum(first))
     down, up = (albedo * beam / (4.0 * math.pi) * found * part / mu for part in first)
@@ -78,7 +71,7 @@ def irradiance(absorption, scattering, phase, depths, *, zenith_deg=60.0, index=
     differences = minus @ sums / rates
     own = np.linalg.solve(plus @ minus - decay**2 * np.eye(mu.size), plus @ (down + up) + decay * (down - up))
     own_difference = (minus @ own - (down + up)) / decay
-    reflected = fresnel(mu, index)[:, None]
+    reflected = reflectance(mu, 1.0 / index)[:, None]
     modes = (sums + differences) - reflected * (sums - differences)
     source = (own + own_difference) - reflected[:, 0] * (own - own_difference)
     amplitudes = np.linalg.solve(modes, -source)

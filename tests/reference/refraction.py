@@ -1,7 +1,22 @@
-"""Rays through a port in float64: Snell's law in vectors at each face, roots and derivatives by brute force."""
+"""Fresnel's equations; rays through a port in float64: Snell's law in vectors at each face, roots and derivatives by
+brute force."""
 
 import numpy as np
 from scipy.optimize import root
+
+
+def amplitudes(cosine, index):
+    """Reflection amplitudes r_s and r_p at a face, from its cosine and the index behind it over that before it; complex
+    beyond the critical angle (Bohren & Huffman 1983, eq 2.67)."""
+    behind = np.emath.sqrt(1.0 - (1.0 - cosine**2) / index**2)
+    s = (cosine - index * behind) / (cosine + index * behind)
+    p = (index * cosine - behind) / (index * cosine + behind)
+    return s, p
+
+
+def reflectance(cosine, index):
+    """Of unpolarised light."""
+    return 0.5 * sum(np.abs(amplitude) ** 2 for amplitude in amplitudes(cosine, index))
 
 
 def face_distance(face, x, u):
@@ -20,14 +35,12 @@ def face_normal(face, x):
 
 
 def refract(u, normal, before, behind):
-    """Direction behind a face, and the transmissions of both polarisations, from Fresnel's amplitudes."""
+    """Direction behind a face, and the transmissions of both polarisations."""
     normal = normal if u @ normal > 0 else -normal
     cos_in = u @ normal
     sine = (u - cos_in * normal) * before / behind
-    cos_out = np.sqrt(1.0 - sine @ sine)
-    reflected_s = (before * cos_in - behind * cos_out) / (before * cos_in + behind * cos_out)
-    reflected_p = (behind * cos_in - before * cos_out) / (behind * cos_in + before * cos_out)
-    return sine + cos_out * normal, 1.0 - reflected_s**2, 1.0 - reflected_p**2
+    s, p = amplitudes(cos_in, behind / before)
+    return sine + np.sqrt(1.0 - sine @ sine) * normal, 1.0 - s**2, 1.0 - p**2
 
 
 def trace(faces, indices, x, u):

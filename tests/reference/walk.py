@@ -103,8 +103,17 @@ def walk(
 
 def scatter(u: NDArray, g: float, rng: np.random.Generator, axis_threshold: float = 1.0) -> NDArray:
     """New directions [N, 3] from Henyey–Greenstein (eq 14), turned as in eq 15; exact unless axis_threshold < 1."""
-    xi = rng.random(len(u))
-    cosine = 1 - 2 * xi if abs(g) < 1e-3 else (1 + g * g - ((1 - g * g) / (1 - g + 2 * g * xi)) ** 2) / (2 * g)
+    return turned(u, scattering_cosine(g, rng, len(u)), rng, axis_threshold)
+
+
+def scattering_cosine(g: float, rng: np.random.Generator, count: int) -> NDArray:
+    """Of Henyey and Greenstein's law (eq 14)."""
+    xi = rng.random(count)
+    return 1 - 2 * xi if abs(g) < 1e-3 else (1 + g * g - ((1 - g * g) / (1 - g + 2 * g * xi)) ** 2) / (2 * g)
+
+
+def turned(u: NDArray, cosine: NDArray, rng: np.random.Generator, axis_threshold: float = 1.0) -> NDArray:
+    """Directions [N, 3] at these cosines to u (eq 15)."""
     sine = np.sqrt(np.maximum(0, 1 - cosine**2))
     phi = 2 * math.pi * rng.random(len(u))
     a, b = sine * np.cos(phi), sine * np.sin(phi)

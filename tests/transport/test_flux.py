@@ -11,6 +11,7 @@ from PIL import Image
 
 import spadwarp
 from reference import irradiance as ordinates
+from reference.refraction import reflectance
 from spadwarp.scene import Scene
 
 FLUX = [
@@ -99,7 +100,7 @@ def facets(zenith, mean_square_slope, index):
     m = np.stack([-p, -q, np.ones_like(p)]) / np.sqrt(1.0 + p**2 + q**2)
     cosine = math.sin(zenith) * m[0] + math.cos(zenith) * m[2]
     seen = np.maximum(cosine, 0.0) / m[2] * np.exp(-(p**2 + q**2) / mean_square_slope)
-    passed = seen / seen.sum() * (1.0 - ordinates.fresnel(np.sqrt(1.0 - (1.0 - cosine**2) / index**2), index))
+    passed = seen / seen.sum() * (1.0 - reflectance(np.sqrt(1.0 - (1.0 - cosine**2) / index**2), 1.0 / index))
     behind = np.sqrt(1.0 - (1.0 - cosine**2) / index**2)
     below = -math.cos(zenith) / index - (behind - cosine / index) * m[2]
     return passed.sum(), (passed / -below).sum()

@@ -10,6 +10,7 @@ import spadwarp_kernels as sk
 from helpers.runs import of_seeds
 from helpers.scenes import BEYOND, PENCIL, scene
 from helpers.statistics_of_samples import equal_means_p
+from reference.walk import scattering_cosine, turned
 from spadwarp.result import analyser_channel
 from spadwarp.scene.medium import Inelastic, Medium
 from spadwarp.values import ConfigError
@@ -44,12 +45,14 @@ def by_path(run, channel=0):
     return run.signed[channel].sum(axis=(0, 1, 2))
 
 
-def quadrature(extinction, new, coefficient, anisotropy):
-    """What is scattered once, with the extinction before and the new one after it."""
+def quadrature(extinction, new, coefficient, anisotropy, start=math.inf):
+    """What is scattered once, with the extinction before and the new one after it: two of each, of the water up to
+    `start` [m] and beyond."""
     z = np.linspace(0.3, 8.0, 100_001)
-    r, area = np.hypot(0.1, z), math.pi * 0.005**2
+    r, area, deep = np.hypot(0.1, z), math.pi * 0.005**2, np.clip(z - start, 0.0, z)
     p = (1.0 + anisotropy * (z / r) ** 2) / (4.0 * math.pi * (1.0 + anisotropy / 3.0))
-    light = coefficient * p * np.exp(-extinction * z - new * r) * area * z / r**3
+    before, after = (c[0] * (z - deep) + c[1] * deep for c in (extinction, new))
+    light = np.where(z > start, *coefficient[::-1]) * p * np.exp(-before - after * r / z) * area * z / r**3
     bins = np.digitize(z + r, EDGES) - 1
     return np.array([np.trapezoid(np.where(bins == k, light, 0.0), z) for k in range(len(EDGES) - 1)])
 
@@ -59,7 +62,7 @@ def test_single_scatter_is_the_quadrature_with_both_coefficients(estimator, devi
     one = pencil(RAMAN, GLOW, estimator=estimator)
     (run,) = of_seeds(one, device, 400_000, [1])
     for k, (new, b, anisotropy) in enumerate(((0.45, 2e-3, A), (0.7, 5e-3, 0.0))):
-        expected = quadrature(0.3, new, b, anisotropy)
+        expected = quadrature((0.3, 0.3), (new, new), (b, b), anisotropy)
         assert by_path(run, k).sum() == pytest.approx(expected.sum(), rel=5e-3)
         np.testing.assert_allclose(by_path(run, k), expected, rtol=2e-2)
 
@@ -70,13 +73,7 @@ def test_each_layer_has_coefficients_of_its_own(start, device):
     """Two waters, and two of which the second is everywhere in sight, against quadrature of single scattering."""
     line = {**RAMAN, "coefficient": [2e-3, 8e-3], "absorption": [0.3, 0.1], "scattering": [0.15, 0.05]}
     (run,) = of_seeds(pencil(line, medium={"layers": [{**DEEPER, "start": start}]}), device, 100_000, [1])
-    z = np.linspace(0.3, 8.0, 100_001)
-    r, area, deep = np.hypot(0.1, z), math.pi * 0.005**2, np.clip(z - start, 0.0, z)
-    p = (1.0 + A * (z / r) ** 2) / (4.0 * math.pi * (1.0 + A / 3.0))
-    depth = 0.3 * (z - deep) + 0.65 * deep + (0.45 * (z - deep) + 0.15 * deep) * r / z
-    light = np.where(z > start, 8e-3, 2e-3) * p * np.exp(-depth) * area * z / r**3
-    bins = np.digitize(z + r, EDGES) - 1
-    expected = np.array([np.trapezoid(np.where(bins == k, light, 0.0), z) for k in range(len(EDGES) - 1)])
+    expected = quadrature((0.3, 0.65), (0.45, 0.15), (2e-3, 8e-3), A, start)
     assert by_path(run).sum() == pytest.approx(expected.sum(), rel=1e-2)
     np.testing.assert_allclose(by_path(run), expected, rtol=3e-2)
 
@@ -130,14 +127,6 @@ def test_energy_balance_has_what_becomes_other_light(device):
     }
 
 
-def turned(u, cosine, rng):
-    """Directions at such cosines to u, at a random azimuth."""
-    across = np.cross(u, np.where(np.abs(u[:, 2:]) < 0.9, [[0.0, 0.0, 1.0]], [[1.0, 0.0, 0.0]]))
-    across /= np.linalg.norm(across, axis=1)[:, None]
-    phi, sine = 2.0 * math.pi * rng.random((len(u), 1)), np.sqrt(np.maximum(1.0 - cosine**2, 0.0))[:, None]
-    return cosine[:, None] * u + sine * (np.cos(phi) * across + np.sin(phi) * np.cross(u, across))
-
-
 def walk(count, rng, *, raman, new, events, g=0.5, extinction=0.3, scattering=0.2, radius=0.2):
     """Raman light by path through a lens in the plane z = 0, by photons that change their wavelength at a collision."""
     x, u = np.tile([-0.1, 0.0, 0.0], (count, 1)), np.tile([0.0, 0.0, 1.0], (count, 1))
@@ -154,7 +143,7 @@ def walk(count, rng, *, raman, new, events, g=0.5, extinction=0.3, scattering=0.
         turns = ~shifted & (rng.random(len(x)) < raman / (scattering + raman))
         weight = weight * np.where(shifted, new[1] / sum(new), (scattering + raman) / extinction)
         shifted = shifted | turns
-        elastic = (1.0 + g * g - ((1.0 - g * g) / (1.0 - g + 2.0 * g * rng.random(len(x)))) ** 2) / (2.0 * g)
+        elastic = scattering_cosine(g, rng, len(x))
         even, cosine = rng.random(len(x)) < 1.0 / (1.0 + A / 3.0), 2.0 * rng.random(len(x)) - 1.0
         u = turned(u, np.where(turns, np.where(even, cosine, np.cbrt(cosine)), elastic), rng)
         kept = path < EDGES[-1]

@@ -5,6 +5,7 @@ import pytest
 
 from helpers.estimators import agreeing_cells, means
 from helpers.scenes import BEYOND, ELSEWHERE, scene
+from reference.refraction import reflectance
 from spadwarp import simulate
 from spadwarp.device import pick_device
 from spadwarp.mesh import build_mesh
@@ -14,13 +15,6 @@ from spadwarp.values import ConfigError
 
 WATER = 1.34
 TURNED = {"position": [0.1, 0.2, 0.3], "rotation_deg": [20.0, -35.0, 50.0]}
-
-
-def reflectance(cosine, outside):
-    ratio = outside / WATER
-    q = np.sqrt(np.maximum(ratio**2 - 1 + cosine**2, 0.0))
-    s, p = (cosine - q) / (cosine + q), (ratio**2 * cosine - q) / (ratio**2 * cosine + q)
-    return np.where(ratio**2 <= 1 - cosine**2, 1.0, 0.5 * (s**2 + p**2))
 
 
 def beam(direction, domain, *, medium=(), max_collisions=7):
@@ -49,7 +43,7 @@ def test_a_beam_between_two_faces_keeps_the_products_of_their_reflectances(devic
         beam([0.3, 0.0, 1.0], {**SLAB, "outside_index": {"z_low": 1.0, "z_high": 2.0}}), photons=64, device=device
     )
     cosine = 1 / np.hypot(0.3, 1.0)
-    r_high, r_low = reflectance(cosine, 2.0), reflectance(cosine, 1.0)
+    r_high, r_low = (reflectance(cosine, outside / WATER) for outside in (2.0, 1.0))
     np.testing.assert_allclose(records.weight, r_high**4 * r_low**3, rtol=1e-4)
     np.testing.assert_allclose(records.path, 13 / cosine, rtol=1e-5)  # 1 m, then 6 times 2 m
     np.testing.assert_allclose(records.direction, np.tile([0.3 * cosine, 0, cosine], (64, 1)), atol=1e-5)
@@ -67,7 +61,7 @@ def test_beyond_the_critical_angle_all_light_is_reflected(device):
     assert (records.weight == 1.0).all() and (records.collisions == 30).all()
     assert records.energy_balance["max_collisions"] == emitted(records)
     below = trace(beam([np.tan(np.radians(47)), 0.0, 1.0], slab, max_collisions=1), photons=64, device=device)
-    np.testing.assert_allclose(below.weight, reflectance(np.cos(np.radians(47)), 1.0), rtol=1e-3)
+    np.testing.assert_allclose(below.weight, reflectance(np.cos(np.radians(47)), 1.0 / WATER), rtol=1e-3)
 
 
 def test_light_in_a_white_box_stays_and_fills_it(device):
@@ -204,7 +198,7 @@ def single_scatter(reflections):
             for side in met:
                 y = 2 * {"y_low": LOW, "y_high": HIGH}[side] - y
             r = np.hypot(y, s)
-            passes = np.prod([reflectance(abs(y) / r, OUTSIDE[side]) for side in met], axis=0) if met else 1.0
+            passes = np.prod([reflectance(abs(y) / r, OUTSIDE[side] / WATER) for side in met], axis=0) if met else 1.0
             phase = (1 - G**2) / (4 * np.pi * (1 + G**2 + 2 * G * s / r) ** 1.5)
             value = ALBEDO * EXTINCTION * np.exp(-EXTINCTION * (s + r)) * phase * AREA * (s / r) / r**2 * passes
             value *= np.abs(y) / s < TANGENT

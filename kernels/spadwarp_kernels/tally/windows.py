@@ -14,42 +14,22 @@ __all__ = [
 ]
 
 _Cube = wp.array3d[wp.vec4]
-_BLOCK = 64  # neighbours that a thread of a processor takes, so that it reads whole lines of its cache
 
 
 @wp.kernel(enable_backward=False)
-def _pixels_kernel(values: wp.array3d[wp.vec4], radius: int, block: int, sums: wp.array3d[wp.vec4]):
-    """Sums over 2 radius + 1 entries of the middle axis. Launch: (outer, inner / block)."""
-    i, part = wp.tid()
-    count, stop = values.shape[1], wp.min((part + 1) * block, values.shape[2])
-    for j in range(count):
-        for k in range(part * block, stop):
-            total = wp.vec4()
-            if j == 0:
-                for ahead in range(wp.min(radius, count)):
-                    total += values[i, ahead, k]
-            else:
-                total = sums[i, j - 1, k]
-            if j + radius < count:
-                total += values[i, j + radius, k]
-            if j > radius:
-                total -= values[i, j - radius - 1, k]
-            sums[i, j, k] = total
-
-
-@wp.kernel(enable_backward=False)
-def _bins_kernel(values: wp.array3d[wp.vec4], radius: int, sums: wp.array3d[wp.vec4]):
-    """Sums over 2 radius + 1 bins; light falls by orders of magnitude over them. Launch: (height, width)."""
-    i, j = wp.tid()
-    count = values.shape[2]
+def _sums_kernel(values: _Cube, radius: int, sums: _Cube):
+    """Sums over 2 radius + 1 entries of the middle axis; light falls by orders of magnitude over them, of which a sum
+    in float32 would leave its rounding. Launch: (outer, inner)."""
+    i, k = wp.tid()
+    count = values.shape[1]
     total = wp.vec4d()
-    for k in range(wp.min(radius, count)):
+    for j in range(wp.min(radius, count)):
         total += wp.vec4d(values[i, j, k])
-    for k in range(count):
-        if k + radius < count:
-            total += wp.vec4d(values[i, j, k + radius])
-        if k > radius:
-            total -= wp.vec4d(values[i, j, k - radius - 1])
+    for j in range(count):
+        if j + radius < count:
+            total += wp.vec4d(values[i, j + radius, k])
+        if j > radius:
+            total -= wp.vec4d(values[i, j - radius - 1, k])
         sums[i, j, k] = wp.vec4(total)
 
 
@@ -59,18 +39,15 @@ def window_sums(values: wp.array, radius: tuple[int, int], work: wp.array, sums:
     `work` and `sums`: other arrays of the same shape, written.
     """
     height, width, bins = values.shape
-    shapes = [(1, height, width * bins), (height, width, bins)] if radius[0] else []
-    block = 1 if values.device.is_cuda else _BLOCK
+    axes = [((1, height, width * bins), radius[0]), ((height, width, bins), radius[0])] if radius[0] else []
+    axes += [((height * width, bins, 1), radius[1])] if radius[1] else []
     source = values
-    outputs = [sums, work, sums] if len(shapes) + bool(radius[1]) == 3 else [work, sums]
-    for shape in shapes:
-        target = outputs.pop(0)
-        inputs: list[Any] = [source.reshape(shape), radius[0], block, target.reshape(shape)]
-        wp.launch(_pixels_kernel, dim=(shape[0], -(-shape[2] // block)), inputs=inputs, device=values.device)
+    for left, (shape, reach) in zip(range(len(axes) - 1, -1, -1), axes, strict=True):
+        target = work if left % 2 else sums
+        inputs: list[Any] = [source.reshape(shape), reach, target.reshape(shape)]
+        wp.launch(_sums_kernel, dim=(shape[0], shape[2]), inputs=inputs, device=values.device)
         source = target
-    if radius[1]:
-        wp.launch(_bins_kernel, dim=(height, width), inputs=[source, radius[1], sums], device=values.device)
-    elif source is values:
+    if source is values:
         wp.copy(sums, values)
 
 

@@ -421,12 +421,10 @@ class WorldCameras:
 
         self.rates = wp.zeros(full("rates"), dtype=float, device=device)
         self.histogram = wp.zeros(full("histogram"), dtype=int, device=device)
-        self.counts, self.status = (wp.zeros(image, dtype=int, device=device) for _ in range(2))
-        self.depth, self.distance, self.true_depth, self.true_distance = (
-            wp.full(image, wp.nan, dtype=float, device=device) for _ in range(4)
-        )
-        self.normal = wp.zeros(image, dtype=wp.vec3, device=device)
-        self.reflectance, self.significance = (wp.zeros(image, dtype=float, device=device) for _ in range(2))
+        for name, var in Images.vars.items():
+            setattr(self, name, wp.zeros(image, dtype=var.type.dtype, device=device))
+        for array in (self.depth, self.distance, self.true_depth, self.true_distance):
+            array.fill_(wp.nan)
         self.step = wp.zeros(1, dtype=wp.int64, device=device)
         self._lines = config.lines_of_sight() if rays is None else self._checked_rays(rays)
         self._scans = rays is not None

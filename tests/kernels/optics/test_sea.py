@@ -9,6 +9,7 @@ from scipy.stats import chisquare
 
 import spadwarp_kernels as sk
 from helpers.launch import launched, unit
+from reference.refraction import reflectance
 from spadwarp_kernels.optics.port import Port
 from spadwarp_kernels.optics.sea import passage_density, sample_passage
 
@@ -79,21 +80,13 @@ def passages(sea, u, above, count, third):
     return launched(passage_kernel, inputs, (wp.vec3, float, int))
 
 
-def fresnel(cosine, ratio):
-    """Reflected part of unpolarised light, in float64."""
-    behind = np.emath.sqrt(1.0 - (1.0 - cosine**2) / ratio**2)
-    s = np.abs((cosine - ratio * behind) / (cosine + ratio * behind)) ** 2
-    p = np.abs((ratio * cosine - behind) / (ratio * cosine + behind)) ** 2
-    return 0.5 * (s + p)
-
-
 def parts(sea, u, above):
     """Transmitted and reflected parts that leave the surface, by the sampler's facets and Fresnel's equations here."""
     u = np.asarray(u, np.float64)
     mirrored, part, reflected = passages(sea, u, above, 1024**2, 0.0)
     assert reflected.all()
     cosine = np.sqrt(np.clip((1.0 + (-u * mirrored).sum(axis=1)) / 2.0, 0.0, 1.0))
-    share = fresnel(cosine, INDEX if above else 1.0 / INDEX)
+    share = reflectance(cosine, INDEX if above else 1.0 / INDEX)
     _, passed, back = passages(sea, u, above, 1024**2, 1.0)
     return ((1.0 - share) * np.where(back, 0.0, passed)).mean(), (share * part).mean()
 
@@ -201,7 +194,7 @@ def test_glint_of_a_parallel_beam():
             t = cosine / math.sqrt((1.0 - cosine**2) * mss)
             return 1.0 / (1.0 + 0.5 * (math.exp(-t * t) / (t * math.sqrt(math.pi)) - math.erfc(t)))
 
-        shape = fresnel(float(-u @ m), INDEX) * facets * masking(-u[2]) * masking(v[2])
+        shape = reflectance(float(-u @ m), INDEX) * facets * masking(-u[2]) * masking(v[2])
         radiance = shape / (4.0 * v[2])
         density = launched(density_kernel, [sea, np.float32([u]), np.float32([v])])[0][0]
         # Power per area of the plane, E cosθ_i, times the density is radiance times cosθ_o.
@@ -214,7 +207,7 @@ def test_footprint_of_a_vertical_beam():
     passed = ~reflected.astype(bool)
     v, part = v[passed], part[passed]
     places = 10.0 * v[:, :2] / -v[:, 2:]
-    weight = part * (1.0 - fresnel(np.ones(1), INDEX)[0])
+    weight = part * (1.0 - reflectance(np.ones(1), INDEX)[0])
     assert math.sqrt(np.average((places**2).sum(axis=1), weights=weight)) == pytest.approx(0.4268, abs=5e-4)
 
 
@@ -242,7 +235,7 @@ def test_connections_by_drawn_points(height, depth, aside, expected):
     u, v = unit(from_point), unit(to_lens)
     between = u * INDEX - v  # along the facet's normal, in the water
     cosine = (u * unit(between)).sum(axis=1)
-    share = 1.0 - fresnel(np.abs(cosine), 1.0 / INDEX)
+    share = 1.0 - reflectance(np.abs(cosine), 1.0 / INDEX)
     values = density / share
     error = values.std() / math.sqrt(len(values))
     assert error < 2e-3 * expected
@@ -255,7 +248,7 @@ def test_connections_become_those_of_a_flat_surface():
     theta = np.linspace(0.0, math.pi / 3, 200_001)
     aside = 200.0 * np.tan(theta) + 10.0 * np.tan(np.arcsin(np.sin(theta) / INDEX))
     theta = np.interp(60.0, aside, theta)
-    share = 1.0 - fresnel(np.array([math.cos(theta)]), INDEX)[0]
+    share = 1.0 - reflectance(np.array([math.cos(theta)]), INDEX)[0]
     assert flat[0] / share == pytest.approx(1.17539e-5, rel=2e-5)
     _, nearly = connections(1e-6, 200.0, 10.0, 60.0)
     assert nearly.mean() == pytest.approx(flat[0], rel=1e-3)

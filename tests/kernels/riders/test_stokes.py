@@ -8,6 +8,7 @@ import warp as wp
 
 import spadwarp_kernels as sk
 from helpers.launch import each, on_device, unit
+from reference.refraction import amplitudes
 from reference.stokes import MIRROR, block_matrix, scattered
 from spadwarp_kernels.base.rotations import orthonormal_basis
 from spadwarp_kernels.riders.polarisation import (
@@ -114,14 +115,6 @@ def test_the_way_back_is_p_m_transposed_p(device):
     there, back = chain(way), chain([-u for u in reversed(way)])
     np.testing.assert_allclose(back, MIRROR @ np.swapaxes(there, 1, 2) @ MIRROR, atol=2e-5)
     assert np.abs(back - np.swapaxes(there, 1, 2)).max() > 0.1  # the plain transpose fails
-
-
-def amplitudes(cosine, index):
-    """Fresnel's reflection amplitudes r_s and r_p, complex beyond the critical angle (Bohren & Huffman, eq 2.67)."""
-    behind = np.sqrt(np.asarray(1.0 - (1.0 - cosine**2) / index**2, np.complex128))
-    s = (cosine - index * behind) / (cosine + index * behind)
-    p = (index * cosine - behind) / (index * cosine + behind)
-    return s, p
 
 
 @pytest.mark.parametrize("index", [1.12, 0.7463, 1.5])
