@@ -153,8 +153,6 @@ def make_requests(spec: TransportSpec) -> tuple[wp.Function, wp.Function]:
                 # By bits that neither the flight nor its score depends on.
                 q.wanted = (s.flight.block[3] & wp.uint32(wp.static(ASIDE_SCORED_IN - 1))) == wp.uint32(0)
                 q.weight *= wp.static(float(ASIDE_SCORED_IN))
-        if wp.static(spec.points > 1):
-            q.weight *= wp.static(1.0 / spec.points)
         q.rounding_sample = s.flight.block[1]  # of the direction to come
         q.component = wp.where(s.surface_count > 0, FORWARD_SCATTERED, BACKSCATTER)
         q.slot = -1
