@@ -330,10 +330,8 @@ def points_per_flight(scene: Scene, kinds: Sequence[str] = (), by_block: Sequenc
     found = " and ".join(name for name, holds in against.items() if holds)
     if points == "auto":
         return 1 if found else 2
-    problem = ""
-    if found:
-        problem = f"cannot be combined with {found}; take 1"
-    elif points > 2 and len(kinds) > 4:
+    problem = f"cannot be combined with {found}; take 1" if found else ""
+    if not found and points > 2 and len(kinds) > 4:
         problem = "goes with up to 4 derivatives; take 2"
     if points > 1 and problem:
         raise ConfigError(f"transport.points_per_flight = {points} {problem}", source=scene.source)

@@ -142,17 +142,13 @@ def _make_asks(spec: TransportSpec, take: wp.Function) -> tuple[wp.Function, wp.
         if wp.static(flights):
             if is_planned(s.flight):
                 request = estimator.request_flight(s)
-                if wp.static(spec.points > 1):
-                    # Flights that lead aside bring none of the variance that more points take off.
-                    several = s.collisions == 0 or s.surface_count > 0 or not leads_aside(s.x, s.u)
-                    request.weight *= wp.where(several, wp.static(1.0 / spec.points), 1.0)
-                    take(s, request, world, sink, memory)
-                    for i in range(wp.static(spec.points - 1)):
-                        other = point_of(request, i + 1)
-                        other.wanted = several
-                        take(s, other, world, sink, memory)
-                else:
-                    take(s, request, world, sink, memory)
+                aside = wp.static(spec.points > 1) and leads_aside(s)  # more points take off nothing
+                request.weight *= wp.where(aside, 1.0, wp.static(1.0 / spec.points))
+                take(s, request, world, sink, memory)
+                for i in range(wp.static(spec.points - 1)):
+                    other = point_of(request, i + 1)
+                    other.wanted = not aside
+                    take(s, other, world, sink, memory)
                 s.flight.interval = wp.vec2(0.0, 0.0)
 
     @wp.func
