@@ -63,7 +63,7 @@ def _at_5m(targets: str | None = None, **changes: Mapping[str, Any]) -> dict[str
     return Scene.merged({**_SCENES["at_5m"], "targets": chosen}, changes)
 
 
-_GUIDED: dict[str, Any] = {"estimator": "guided"}
+_GUIDED: dict[str, Any] = {"estimator": "guided", "points_per_flight": 1}  # as in the history of their speed
 _COAXIAL = {"half_angle_deg": 0.1, "position": [0.0, 0.0, 0.0]}
 _STAIRCASE = _at_5m("staircase")
 _DENSE = Scene.merged(_STAIRCASE, {"targets": {index: {"subdivisions": 5} for index in range(10)}})

@@ -108,7 +108,6 @@ if __name__ == "__main__":
         more={
             "seeds": (16, "runs whose spread is the error; 0: no errors"),
             "roulette-from": (5, "mitransient's rr_depth"),
-            "points-per-flight": (1, "of spadwarp, in the comparison of variance x time"),
         },
     )
     seeds, roulette_from = args.seeds, args.roulette_from
@@ -146,7 +145,7 @@ if __name__ == "__main__":
         return np.array(film, dtype=np.float64)[..., 0], took
 
     our_scene = spadwarp.Scene.from_dict(CASES["staircase_5m_guided"].scene).with_overrides(
-        {"transport.points_per_flight": args.points_per_flight}
+        {"transport.points_per_flight": "auto"}
     )
 
     def ours(seed: int) -> tuple[np.ndarray, float]:

@@ -258,8 +258,8 @@ class Transport(Section):
     seed: Whole = field(0, "key of the random numbers; one seed gives the same bits", SEED)
     estimator: Literal["analog", "next_event", "guided", "none"] = "guided"
     """what scores: the photon itself, every event, or guided flights; none: the camera sees nothing, for flux alone"""
-    points_per_flight: Whole = Field(1, ge=1, le=3)
-    """points at which `guided` scores a flight; more leave less noise in the bins of a pixel and take longer"""
+    points_per_flight: Annotated[Whole, Field(ge=1, le=3)] | Literal["auto"] = "auto"
+    """points at which `guided` scores a flight: more leave less noise and take longer; "auto": 2, where it can be"""
     termination: Literal["cutoff", "roulette"] = field("cutoff", "drop light photons (biased), or Russian roulette")
     weight_cutoff: float = field(2e-4, "analog weight below which a photon ends; 0 is never", "[0, 1)")
     max_collisions: Whole = field(64, "events of one photon, surfaces included; the last counts", "[1, 2147483647]")

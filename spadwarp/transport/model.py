@@ -318,7 +318,7 @@ def _grid_tracking(scene: Scene) -> Any:
 def points_per_flight(scene: Scene, kinds: Sequence[str] = (), by_block: Sequence[str] = ()) -> int:
     """Points at which a flight is scored, with these kinds of derivatives and those by block.
 
-    Raises `ConfigError` for what cannot be combined with several.
+    Raises `ConfigError` for a number that cannot be combined with the rest.
     """
     points, estimator = scene.transport.points_per_flight, scene.transport.estimator
     against = {
@@ -327,10 +327,11 @@ def points_per_flight(scene: Scene, kinds: Sequence[str] = (), by_block: Sequenc
         "derivatives by block": bool(by_block),
         'medium.grid.tracking = "delta"': _grid_tracking(scene) is sk.DELTA_TRACKING,
     }
-    problem = ""
-    if found := " and ".join(name for name, holds in against.items() if holds):
-        problem = f"cannot be combined with {found}; take 1"
-    elif points > 2 and len(kinds) > 4:
+    found = " and ".join(name for name, holds in against.items() if holds)
+    if points == "auto":
+        return 1 if found else 2
+    problem = f"cannot be combined with {found}; take 1" if found else ""
+    if not found and points > 2 and len(kinds) > 4:
         problem = "goes with up to 4 derivatives; take 2"
     if points > 1 and problem:
         raise ConfigError(f"transport.points_per_flight = {points} {problem}", source=scene.source)

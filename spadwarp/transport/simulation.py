@@ -26,6 +26,7 @@ from spadwarp.result.file import TARGETS_DIFFER, same_targets
 from spadwarp.result.result import NOISE_GOAL, ResultHead, largest_share, unseen_warnings
 from spadwarp.result.tallies import IdQueue, Range, Ranges, check_capacity, count, joined, without
 from spadwarp.scene import SceneLike, as_scene
+from spadwarp.transport.model import points_per_flight
 from spadwarp.transport.plan import Plan, RunOptions, make_plan
 from spadwarp.transport.workers import ClusterWorkers, LocalWorkers, trace_block
 from spadwarp.values import (
@@ -176,10 +177,11 @@ def simulate(
 
 def _warn_of_rounding(result: Result) -> None:
     """Warns where contributions are so small that rounding them to the tally's unit decides the error."""
+    many = _MANY * points_per_flight(result.scene)  # each point has so small a part of a flight's contribution
     for name, tally in zip(result.scene.components, result.tallies, strict=True):
         small = result.counters.get(f"below_unit_{name}", 0)
         # The first rows of pixels mostly show that there is more.
-        if small <= _MANY or any(total * _MANY >= small for total in accumulate(map(_units, tally))):
+        if small <= many or any(total * many >= small for total in accumulate(map(_units, tally))):
             continue
         total, error = _units(tally), result.rounding_error[name]
         if error > _LARGEST_ROUNDING_ERROR:

@@ -9,6 +9,7 @@ from helpers.runs import of_seeds
 from helpers.scenes import BEYOND, ELSEWHERE, scene
 from helpers.statistics_of_samples import DEVICES, equal_means_p
 from spadwarp import simulate
+from spadwarp.transport import points_per_flight
 from spadwarp.values import ConfigError
 
 BARS = [
@@ -96,5 +97,7 @@ def test_what_goes_with_one_point_alone_is_refused(changes, named, device):
     for refuse in (lambda: simulate(one, photons=100, device=device), lambda: spadwarp.check(one)):
         with pytest.raises(ConfigError, match=text):
             refuse()
+    assert points_per_flight(one.with_overrides({"transport.points_per_flight": "auto"})) == 1
+    assert points_per_flight(scene()) == 2
     with pytest.raises(ConfigError, match="points_per_flight"):
         scene(transport={"points_per_flight": 4})

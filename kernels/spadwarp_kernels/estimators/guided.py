@@ -110,14 +110,14 @@ def make_choose_meeting(spec: TransportSpec) -> wp.Function:
 
 
 @wp.func
-def leads_aside(x: wp.vec3, u: wp.vec3) -> bool:
-    """Whether light has to turn by more than 26 degrees (cosine 0.9) to reach the lens, from any point of the flight
-    from x along u: the angle is least at its first point.
+def leads_aside(s: wp.ref[PhotonState]) -> bool:
+    """Whether a flight after collisions alone turns by more than 26 degrees (cosine 0.9) to the lens, from any of its
+    points: the angle is least at the first.
 
-    After a collision in the water such flights are a third of what is scored; they bring weak, even scores, and next to
-    nothing of the variance of bins where it is large.
+    Such flights are a third of what is scored; they bring weak, even scores, and next to nothing of the variance of
+    bins where it is large.
     """
-    return wp.dot(x, u) > -0.9 * wp.length(x)
+    return s.collisions > 0 and s.surface_count == 0 and wp.dot(s.x, s.u) > -0.9 * wp.length(s.x)
 
 
 def make_requests(spec: TransportSpec) -> tuple[wp.Function, wp.Function]:
@@ -149,12 +149,10 @@ def make_requests(spec: TransportSpec) -> tuple[wp.Function, wp.Function]:
                 q.weight *= wp.where(collision, 2.0, 1.0)
                 q.first = (q.first << wp.uint32(1)) >> wp.uint32(1)
         if wp.static(spares):
-            if s.collisions > 0 and s.surface_count == 0 and leads_aside(s.x, s.u):
+            if leads_aside(s):
                 # By bits that neither the flight nor its score depends on.
                 q.wanted = (s.flight.block[3] & wp.uint32(wp.static(ASIDE_SCORED_IN - 1))) == wp.uint32(0)
                 q.weight *= wp.static(float(ASIDE_SCORED_IN))
-        if wp.static(spec.points > 1):
-            q.weight *= wp.static(1.0 / spec.points)
         q.rounding_sample = s.flight.block[1]  # of the direction to come
         q.component = wp.where(s.surface_count > 0, FORWARD_SCATTERED, BACKSCATTER)
         q.slot = -1

@@ -7,6 +7,7 @@ import warp as wp
 from spadwarp_kernels.base.kernels import memoised
 from spadwarp_kernels.estimators.contribution import Scored, make_point_of
 from spadwarp_kernels.estimators.estimator import Estimator
+from spadwarp_kernels.estimators.guided import leads_aside
 from spadwarp_kernels.estimators.mirrored import make_score_images
 from spadwarp_kernels.estimators.registry import make_estimator
 from spadwarp_kernels.photon.queue import Request, long_queue_fits, make_queue
@@ -141,9 +142,13 @@ def _make_asks(spec: TransportSpec, take: wp.Function) -> tuple[wp.Function, wp.
         if wp.static(flights):
             if is_planned(s.flight):
                 request = estimator.request_flight(s)
+                aside = wp.static(spec.points > 1) and leads_aside(s)  # more points take off nothing
+                request.weight *= wp.where(aside, 1.0, wp.static(1.0 / spec.points))
                 take(s, request, world, sink, memory)
                 for i in range(wp.static(spec.points - 1)):
-                    take(s, point_of(request, i + 1), world, sink, memory)
+                    other = point_of(request, i + 1)
+                    other.wanted = not aside
+                    take(s, other, world, sink, memory)
                 s.flight.interval = wp.vec2(0.0, 0.0)
 
     @wp.func
