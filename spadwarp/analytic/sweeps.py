@@ -174,12 +174,14 @@ def combinations(scene: SceneLike, vary: Any, *, planned: bool) -> tuple[tuple[s
             if field == "range":
                 arguments["ranges"] = (value, value)
             elif field == _ANALYSER:
-                check_choice(f"vary: {_ANALYSER}", value, ("none", *POLARISED))
-                arguments["channel"] = "I" if value == "none" else value
+                word = check_choice(f"vary: {_ANALYSER}", value, ("none", *POLARISED))
+                arguments["channel"] = "I" if word == "none" else word
                 if value != "none" and not scene.camera.channels:
                     overrides["camera.polarisation"] = "analyser"
             elif field.endswith(".preset") and value == "none":
                 overrides[field.removesuffix(".preset")] = None
+                if field == "camera.port.preset" and scene.laser.port == "camera":  # the laser shines through it
+                    overrides["laser.port"] = None
             else:
                 overrides[field] = value
         changed = scene.with_overrides(overrides)

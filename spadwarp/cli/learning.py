@@ -159,8 +159,7 @@ def evaluate(
         opt.refuse("cannot be combined with --fresh, which makes scenes of its own", "DATA", "--models", "--report")
         run, show, write, options = evaluation.evaluate_fresh, _show_fresh, None, {"scenes": fresh, "seed": seed}
     elif data is not None and (data.is_file() or (data / "result.h5").is_file()):
-        result = opt.load_run(data)
-        if problem := spadwarp.result.noise_problem(result):
+        if problem := spadwarp.result.noise_problem(result := opt.load_run(data)):
             complain(problem, "warning")  # it counts as light here
         run, show = partial(evaluation.photon_sweep, result), _show_photons
         options["models"] = [name for name in chosen if name != "bm3d"] + ["histograms"] * (models == "all")

@@ -146,20 +146,15 @@ def test_a_sweep_follows_the_lidar_equation():
 
 
 def test_choices_of_an_experiment_are_combined():
-    fields, chosen = combinations(
-        SCENE.with_overrides({"medium.chlorophyll": 0.5, "laser.polarisation": "linear"}),
-        [
-            "laser.wavelength_nm=480,532",
-            "camera.analyser=none,cross",
-            "camera.port.preset=none,flat-glass",
-            "range=2 m",
-        ],
-        planned=True,
-    )
+    seen = {"laser.polarisation": "linear", "laser.port": "camera", "camera.port.preset": "flat-glass"}
+    vary = ["laser.wavelength_nm=480,532", "camera.analyser=none,cross", "camera.port.preset=none,flat-glass"]
+    scene = SCENE.with_overrides({"medium.chlorophyll": 0.5, **seen})
+    fields, chosen = combinations(scene, [*vary, "range=2 m"], planned=True)
     assert len(chosen) == 8 and len(fields) == 4
     assert len({scene.medium.absorption for _, scene, _ in chosen}) == 2  # blue and green water
     assert {arguments["channel"] for _, _, arguments in chosen} == {"I", "cross"}
-    assert all((one.camera.port is None) == (values[2] == "none") for values, one, _ in chosen)
+    for values, one, _ in chosen:  # a laser behind the camera's port is in the water without it
+        assert (one.camera.port is None) == (one.laser.port is None) == (values[2] == "none")
     assert all(arguments["ranges"] == (2.0, 2.0) for *_, arguments in chosen)
 
 
