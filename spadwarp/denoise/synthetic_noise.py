@@ -301,6 +301,7 @@ BINS = 64
 COUNT_BINS = (64, 96, 128, 192, 256, 400)
 """Bins of the histograms behind frames with few photons, one number for each batch."""
 
+_SHORTEST = 0.1  # gate that ends within a scene [m]
 _RARER = 1.5  # power of a uniform number: low backscatter fractions are drawn more often than high ones
 _WRONG = (0.5, 2.0)  # factors on a background, and on the width of a response, that are not known well
 _FLOOR = 0.01  # part of the signal that may come in any bin, where a response is fitted
@@ -460,6 +461,9 @@ def _draw_crops(scenes: CleanScenes, noise: Noise, crop: int, random: Random, fi
     start = low - (width - (high - low)) * random.uniform()
     start = torch.where(own, gate[:, 0], start)
     width = torch.where(own, gate[:, 1] - gate[:, 0], width)
+    if noise.cut > 0.0:
+        end = torch.lerp(low, high, random.between((0.5, 1.0)))
+        width = torch.where(random.coin(noise.cut), (end - start).clamp_min(_SHORTEST), width)
     clean = (depth - start[:, None, None]) / width[:, None, None]
     hit &= (clean >= 0.0) & (clean < 1.0)
     clean = torch.where(hit, clean, 1.0)
