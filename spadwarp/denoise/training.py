@@ -96,7 +96,7 @@ def _target_error(logit: Tensor, batch: Batch) -> Tensor:
 
 # Steps
 
-_EAGER = 3  # steps of a kind before one is recorded as a CUDA graph
+_EAGER = 1  # steps of a kind before one is recorded as a CUDA graph
 
 
 @dataclass(frozen=True, kw_only=True)
