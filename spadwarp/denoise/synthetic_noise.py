@@ -301,7 +301,6 @@ BINS = 64
 COUNT_BINS = (64, 96, 128, 192, 256, 400)
 """Bins of the histograms behind frames with few photons, one number for each batch."""
 
-_SHORTEST = 0.1  # gate that ends within a scene [m]
 _RARER = 1.5  # power of a uniform number: low backscatter fractions are drawn more often than high ones
 _WRONG = (0.5, 2.0)  # factors on a background, and on the width of a response, that are not known well
 _FLOOR = 0.01  # part of the signal that may come in any bin, where a response is fitted
@@ -463,7 +462,7 @@ def _draw_crops(scenes: CleanScenes, noise: Noise, crop: int, random: Random, fi
     width = torch.where(own, gate[:, 1] - gate[:, 0], width)
     if noise.cut > 0.0:
         end = torch.lerp(low, high, random.between((0.5, 1.0)))
-        width = torch.where(random.coin(noise.cut), (end - start).clamp_min(_SHORTEST), width)
+        width = torch.where(random.coin(noise.cut), torch.maximum(end - start, 0.05 * width), width)
     clean = (depth - start[:, None, None]) / width[:, None, None]
     hit &= (clean >= 0.0) & (clean < 1.0)
     clean = torch.where(hit, clean, 1.0)
@@ -701,10 +700,7 @@ def _scattered(rate: Tensor, noise: Noise, generator: torch.Generator) -> Tensor
         across = torch.matmul(spread(width, scale * factor)[:, None], late)
         light += part[:, None, None, None] * torch.bmm(spread(height, scale * factor), across.flatten(2)).view_as(rate)
     rough = random.between(noise.roughness, 1, 1)[..., None]
-    if noise.roughness[1] > 0:
-        light *= random.normal(rate.shape).mul_(rough).sub_(0.5 * rough.square()).exp_()
-    share = random.uniform(1, 1)
-    if noise.halo > 0.0:
-        thin = 1.0 - torch.exp(-random.log_between((0.01, 3.0), 1, 1))
-        share = torch.where(random.coin(noise.halo, 1, 1), thin, share)
+    light *= random.normal(rate.shape).mul_(rough).sub_(0.5 * rough.square()).exp_()
+    thin = 1.0 - torch.exp(-random.log_between((0.01, 3.0), 1, 1))
+    share = torch.where(random.coin(noise.halo, 1, 1), thin, random.uniform(1, 1))
     return torch.lerp(rate, light, share[..., None])

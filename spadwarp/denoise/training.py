@@ -262,18 +262,17 @@ class Run:
         samples.hold()
         graph = torch.cuda.CUDAGraph()
         torch.cuda.synchronize()
+        self.graphs[samples.kind] = None
         try:
             graph.register_generator_state(self.generator)
             self.optimiser.zero_grad(set_to_none=True)
             with torch.cuda.graph(graph, pool=self.pool):
                 loss = self._work(samples)
             self.pool = graph.pool()
+            self.graphs[samples.kind] = graph, loss
         except (RuntimeError, AttributeError) as error:
             warnings.warn(f"no CUDA graph of a training step: {error}", stacklevel=2)
             torch.cuda.synchronize()
-            self.graphs[samples.kind] = None
-            return
-        self.graphs[samples.kind] = graph, loss
 
     def _work(self, samples: Samples) -> Tensor:
         self.network.train()
