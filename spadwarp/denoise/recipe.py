@@ -66,7 +66,6 @@ class Noise(Section):
     )
     spread: Positive = Field((0.5, 20.0), description="its spread over the image [pixels], uniform in the logarithm")
     halo: Share = Field(0.0, description="of these, samples with an optical depth of 0.01 to 3, mostly a halo")
-    halo: Share = Field(0.0, description="of these, samples with an optical depth of 0.01 to 3, mostly a halo")
     roughness: Limits = Field((0.0, 0.0), description="standard deviation of that light's logarithm from bin to bin")
     ambient: Share = Field(0.0, description="of these, samples with ambient light, which follows the reflectance")
     two_returns: Share = Field(0.4, description="of these, samples in which pixels see a weaker second surface")
