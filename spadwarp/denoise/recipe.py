@@ -53,6 +53,7 @@ class Noise(Section):
     own_gate: Share = Field(0.5, description="samples with the scene's own gate; the others have one of gate_width")
     own_profile: Share = Field(0.7, description="of these, samples with the scene's own backscatter profile")
     gate_width: Positive = Field((1.0, 8.0), description="width of other gates [m], uniform in the logarithm")
+    cut: Share = Field(0.0, description="samples whose gate ends within the scene: what is behind has no depth")
     wide_gate: Share = Field(0.5, description="samples whose camera's gate is wider than what the network is given")
     behind: Share = Field(0.55, description="samples with backscatter from behind the target too: multiple scattering")
     slanted_gate: Share = Field(0.5, description="samples whose gate opens up to 15 % of its width nearer in depth")
@@ -64,7 +65,7 @@ class Noise(Section):
         (0.004, 0.12), description="mean delay of that light [gate widths], uniform in the logarithm"
     )
     spread: Positive = Field((0.5, 20.0), description="its spread over the image [pixels], uniform in the logarithm")
-    halo: Share = Field(0.0, description="of these, samples in which at most 70 % of the light is scattered: a halo")
+    halo: Share = Field(0.0, description="of these, samples with an optical depth of 0.01 to 3, mostly a halo")
     roughness: Limits = Field((0.0, 0.0), description="standard deviation of that light's logarithm from bin to bin")
     ambient: Share = Field(0.0, description="of these, samples with ambient light, which follows the reflectance")
     two_returns: Share = Field(0.4, description="of these, samples in which pixels see a weaker second surface")

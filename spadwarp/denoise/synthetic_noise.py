@@ -460,6 +460,9 @@ def _draw_crops(scenes: CleanScenes, noise: Noise, crop: int, random: Random, fi
     start = low - (width - (high - low)) * random.uniform()
     start = torch.where(own, gate[:, 0], start)
     width = torch.where(own, gate[:, 1] - gate[:, 0], width)
+    if noise.cut > 0.0:
+        end = torch.lerp(low, high, random.between((0.5, 1.0)))
+        width = torch.where(random.coin(noise.cut), torch.maximum(end - start, 0.05 * width), width)
     clean = (depth - start[:, None, None]) / width[:, None, None]
     hit &= (clean >= 0.0) & (clean < 1.0)
     clean = torch.where(hit, clean, 1.0)
@@ -626,10 +629,10 @@ def _draw_counts(
     for depth, signal in zip(seen.unbind(dim=1), each.unbind(dim=1), strict=True):
         add(depth, signal * (1.0 - share))
     add(second, shade * share)
-    rate = torch.bmm(rate.flatten(1, 2), toeplitz(true, bins).mT).view_as(rate)
     scattered = round(noise.scattered * len(clean))
     if scattered:
         rate[:scattered] = _scattered(rate[:scattered], noise, generator)
+    rate = torch.bmm(rate.flatten(1, 2), toeplitz(true, bins).mT).view_as(rate)
     from_before = (edges[:-1] < (reach * bins)[..., None]) | ambient[:, None, None, None]
     rate += level[:, None, None] * bright[..., None] * from_before
     counts = torch.poisson(rate.add_(1e-4), generator=generator)
@@ -665,10 +668,12 @@ def _estimate(counts: Tensor, level: Tensor, response: Tensor, photons: Tensor) 
 def _scattered(rate: Tensor, noise: Noise, generator: torch.Generator) -> Tensor:
     """The signal rate `[B, h, w, T]` with a part of it scattered forward.
 
-    Light that water scatters forward travels farther: its delay is drawn as a sum of two exponentials, after a first
-    delay. It also seems to come from beside the pixel, by the sum of two exponentials, one four times as wide. Energy
-    is conserved, except for what leaves the gate. The rate may be rough, as histograms of a simulation with few photons
-    are.
+    Light that water scatters by θ at a distance d before the target seems to come from d θ beside it, and its path is
+    longer by d θ² / 2. So light from near is as early as the target's, and the delay grows with the spread. Single
+    scattering by a lobe of phase function gives a radiance that falls as 1 / φ within the lobe and as 1 / φ³ outside:
+    here three Gaussians, whose widths and mean delays grow by the same factor. The part of the light follows from the
+    optical depth. Energy is conserved, except for what leaves the gate. The rate may be rough, as histograms of a
+    simulation with few photons are.
     """
     size, height, width, bins = rate.shape
     device, random = rate.device, Random(size, generator)
@@ -682,22 +687,20 @@ def _scattered(rate: Tensor, noise: Noise, generator: torch.Generator) -> Tensor
 
     def spread(length: int, scale: Tensor) -> Tensor:
         place = torch.arange(length, device=device)
-        weight = torch.exp(-(place - place[:, None]).abs() / scale)
+        weight = torch.exp(-0.5 * ((place - place[:, None]) / scale).square())
         return weight / weight.sum(dim=2, keepdim=True)
 
-    delay, slow = random.log_between(noise.delay, 1, 1), 0.6 * random.uniform(1, 1)
-    late = (1.0 - slow) * delayed(delay) + slow * delayed(delay * (2.0 + 4.0 * random.uniform(1, 1)))
-    late = delayed(delay * 0.7 * random.uniform(1, 1)) @ late
-    scale, far = random.log_between(noise.spread, 1, 1), 0.7 * random.uniform(1, 1, 1)
-    after = torch.bmm(rate.flatten(1, 2), late).view_as(rate)
+    delay, scale = random.log_between(noise.delay, 1, 1), random.log_between(noise.spread, 1, 1)
+    first = delayed(delay * random.uniform(1, 1))  # of light that is scattered several times
+    growth, parts = random.log_between((2.0, 5.0), 1, 1), random.uniform(3)
     light = torch.zeros_like(rate)
-    for reach, part in ((scale, 1.0 - far), (4.0 * scale, far)):
-        spread_light = torch.matmul(spread(width, reach)[:, None], after)
-        light += part * torch.bmm(spread(height, reach), spread_light.flatten(2)).view_as(rate)
+    for power, part in zip((-1, 0, 1), (parts / parts.sum(dim=1, keepdim=True)).unbind(dim=1), strict=True):
+        factor = growth**power
+        late = torch.bmm(rate.flatten(1, 2), delayed(delay * factor) @ first).view_as(rate)
+        across = torch.matmul(spread(width, scale * factor)[:, None], late)
+        light += part[:, None, None, None] * torch.bmm(spread(height, scale * factor), across.flatten(2)).view_as(rate)
     rough = random.between(noise.roughness, 1, 1)[..., None]
-    if noise.roughness[1] > 0:
-        light *= random.normal(rate.shape).mul_(rough).sub_(0.5 * rough.square()).exp_()
-    share = random.uniform(1, 1)
-    if noise.halo > 0.0:
-        share = torch.where(random.coin(noise.halo, 1, 1), random.log_between((0.01, 0.7), 1, 1), share)
+    light *= random.normal(rate.shape).mul_(rough).sub_(0.5 * rough.square()).exp_()
+    thin = 1.0 - torch.exp(-random.log_between((0.01, 3.0), 1, 1))
+    share = torch.where(random.coin(noise.halo, 1, 1), thin, random.uniform(1, 1))
     return torch.lerp(rate, light, share[..., None])

@@ -96,8 +96,6 @@ def _target_error(logit: Tensor, batch: Batch) -> Tensor:
 
 # Steps
 
-_EAGER = 3  # steps of a kind before one is recorded as a CUDA graph
-
 
 @dataclass(frozen=True, kw_only=True)
 class Trained:
@@ -179,8 +177,7 @@ class Run:
         self.state = {"network": self.network, "average": self.average, "optimiser": self.optimiser}
         self.loss_sum = torch.zeros((), device=device)  # of the steps since the last report
         self.step, spent = self._resume()
-        self.eager: dict[Any, int] = {}  # steps that were not replayed, of samples of a kind
-        self.graphs: dict[Any, tuple[Any, Tensor]] = {}  # the recorded step and its loss
+        self.graphs: dict[Any, tuple[Any, Tensor] | None] = {}  # recorded steps and losses, of samples of a kind
         self.pool: Any = None  # memory that recorded steps share
         self.side: Any = torch.cuda.Stream() if is_cuda else None
         self.last_report, self.timed_from = time.monotonic(), self.step
@@ -243,8 +240,8 @@ class Run:
         (group,) = self.optimiser.param_groups
         group["lr"] = group["lr"].fill_(rate) if isinstance(group["lr"], Tensor) else rate
         samples = self.samples.of(self.step)
-        if (kind := samples.kind) in self.graphs:
-            graph, loss = self.graphs[kind]
+        if recorded := self.graphs.get(samples.kind):
+            graph, loss = recorded
             graph.replay()
         elif (side := self.side) is not None:
             side.wait_stream(torch.cuda.current_stream())
@@ -257,27 +254,25 @@ class Run:
         _update_mean(self.average, self.network, settings.averaging if self.step > settings.warm_up else 0.0)
         self.loss_sum += loss
         self.step += 1
-        if kind not in self.graphs:
-            self.eager[kind] = self.eager.get(kind, 0) + 1
-            if self.side is not None and self.eager[kind] == _EAGER:
-                self._capture(samples)
+        if self.side is not None and samples.kind not in self.graphs:
+            self._capture(samples)
 
     def _capture(self, samples: Samples) -> None:
         """Records a step as a CUDA graph; where that fails, training goes on step by step."""
         samples.hold()
         graph = torch.cuda.CUDAGraph()
         torch.cuda.synchronize()
+        self.graphs[samples.kind] = None
         try:
             graph.register_generator_state(self.generator)
             self.optimiser.zero_grad(set_to_none=True)
             with torch.cuda.graph(graph, pool=self.pool):
                 loss = self._work(samples)
             self.pool = graph.pool()
+            self.graphs[samples.kind] = graph, loss
         except (RuntimeError, AttributeError) as error:
             warnings.warn(f"no CUDA graph of a training step: {error}", stacklevel=2)
             torch.cuda.synchronize()
-            return
-        self.graphs[samples.kind] = graph, loss
 
     def _work(self, samples: Samples) -> Tensor:
         self.network.train()

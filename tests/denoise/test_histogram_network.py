@@ -143,6 +143,9 @@ def test_scattered_light_is_delayed_and_spread():
     assert (mean > 0.02).all() and (mean < 0.01 * 192 * 6 * 1.7).all()
     assert (found[:, 16, 16].sum(dim=1) < 1.0).all() and (found[:, 16, 20].sum(dim=1) > 0).all()
     assert torch.allclose(found[:, 12], found[:, 20]) and torch.allclose(found[:, :, 12], found[:, :, 20])
+    # Seen farther away, light was scattered by larger angles, or earlier: its path is longer.
+    near, far = ((one * bins).sum(dim=1) / one.sum(dim=1) for one in (found[:, 16, 17], found[:, 16, 22]))
+    assert (near < far).all()
 
 
 def test_scattered_light_is_dimmer_and_later_than_a_target():

@@ -93,6 +93,12 @@ def test_a_pixel_sees_the_area_of_its_subpixels():
     seen = share[(share > 0.1) & (share < 0.9)]
     assert abs(float(seen.median()) - 2 / 3) < 0.03
 
+    # A gate from 0.5 m that ends between 1.5 and 2 m: the farther half has no depth and sends no light.
+    given = {"size": 16, "crop": side, "generator": torch.Generator().manual_seed(2), "histograms": True, "bins": 64}
+    batch = draw_batch(scenes, noise.model_copy(update={"cut": 1.0}), finer=SUBPIXELS, **given)
+    assert ((batch.clean < 0.5) == (batch.hit > 0)).all() and (batch.clean > 1 / 3).all()
+    assert batch.inputs[0].sum(dim=-1)[batch.hit[:, 0] == 0].median() < 100
+
 
 def test_of_two_scenes_a_pixel_sees_the_nearer():
     scenes = procedural_scenes(12, 48, seed=3, device="cpu")
