@@ -267,7 +267,7 @@ def estimate_histograms(
 
 
 _MARGIN = 32  # pixels around a part of a large frame that are seen, too
-_AT_ONCE = 5 << 20  # bins of all pixels that are computed at once: little memory
+_AT_ONCE = 7 << 20  # bins of all pixels that are computed at once: in float32 less than the 32 MiB that malloc keeps
 _LEAST_PART = 96  # pixels of a side: smaller parts would see more of others than of their own
 
 

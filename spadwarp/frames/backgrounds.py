@@ -155,12 +155,13 @@ def _opening(seen: NDArray[np.float64], expected: NDArray[np.float64]) -> NDArra
 
 def _blocks(frames: NDArray[Any]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """Counts of blocks of pixels `[blocks, T]`, and how many pixels each has."""
-    height, width = frames.shape[1:3]
-    rows, columns = np.arange(0, height, _BLOCK), np.arange(0, width, _BLOCK)
-    sums = np.add.reduceat(frames, rows, axis=1, dtype=np.float64)
-    sums = np.add.reduceat(sums, columns, axis=2)
-    sizes = np.outer(np.diff([*rows, height]), np.diff([*columns, width])).ravel()
-    return sums.reshape(-1, frames.shape[-1]), np.tile(sizes, len(frames)).astype(np.float64)
+    counts = [-(-side // _BLOCK) for side in frames.shape[1:3]]
+    sums, sizes = np.zeros((len(frames), *counts, frames.shape[-1])), np.zeros(counts)
+    for row, column in np.ndindex(_BLOCK, _BLOCK):  # many times faster than reduceat
+        some = frames[:, row::_BLOCK, column::_BLOCK]
+        sums[:, : some.shape[1], : some.shape[2]] += some
+        sizes[: some.shape[1], : some.shape[2]] += 1.0
+    return sums.reshape(-1, frames.shape[-1]), np.tile(sizes.ravel(), len(frames))
 
 
 def return_width(response: ArrayLike | float) -> int:
