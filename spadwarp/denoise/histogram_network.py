@@ -9,7 +9,6 @@ how much the photons of others tell, where depth jumps, and what light is of no 
 
 from __future__ import annotations
 
-import math
 from collections.abc import Iterator
 from functools import partial, reduce
 from itertools import pairwise
@@ -123,11 +122,8 @@ class _Conv(nn.Conv3d):
     def forward(self, x: Tensor) -> Tensor:
         if self.kernel_size[2] == 1:
             return self._convolved(x)
-        count, step = x.shape[1], _at_once(x)
-        x = F.pad(x, (0, 0, 0, 0, 0, 0, 1, 1))
-        stops = [min(first + step, count) for first in range(0, count, step)]
-        parts = (range(first, stop) for first, stop in zip([0, *stops], stops, strict=False))
-        beside = ([x[:, part.start + k : part.stop + k] for k in range(3)] for part in parts)
+        count, step, x = x.shape[1], _at_once(x), F.pad(x, (0, 0, 0, 0, 0, 0, 1, 1))
+        beside = zip(*(x[:, first : first + count].split(step, dim=1) for first in range(3)), strict=True)
         found = [self._convolved(torch.cat(cells, dim=-1)) for cells in beside]
         return found[0] if len(found) == 1 else torch.cat(found, dim=1)
 
@@ -256,15 +252,15 @@ class HistogramNet(nn.Module):
         cells, count = cells.permute(0, 4, 2, 3, 1), cells.shape[-1]
         at_once = _at_once(image.expand(-1, count, -1, -1, -1))
         parts = [self.enter(part.contiguous()) + image for part in cells.split(at_once, dim=1)]
-        heads, highest, mean = [], image.new_full((), -math.inf), image.new_zeros(())
-        for x in self.pyramid(parts):
-            heads.append(self.head(x))
-            highest = torch.maximum(highest, x.amax(dim=1, keepdim=True))
-            mean = mean + x.mean(dim=1, keepdim=True) * (x.shape[1] / count)
-        (target,) = self.target_pyramid(
-            [self.enter_target(torch.cat([highest, mean, images.permute(0, 2, 3, 1)[:, None]], dim=-1))]
+        found = [(self.head(x), x.amax(dim=1, keepdim=True), x.sum(dim=1, keepdim=True)) for x in self.pyramid(parts)]
+        heads, most, sums = (torch.cat(each, dim=1) for each in zip(*found, strict=True))
+        ends = (
+            most.amax(dim=1, keepdim=True),
+            sums.sum(dim=1, keepdim=True) / count,
+            images.permute(0, 2, 3, 1)[:, None],
         )
-        return torch.cat(heads, dim=1), self.target(target)[:, 0, ..., 0]
+        (target,) = self.target_pyramid([self.enter_target(torch.cat(ends, dim=-1))])
+        return heads, self.target(target)[:, 0, ..., 0]
 
     def _seen(
         self, volumes: list[Tensor], tops: list[Tensor], counts: Tensor, background: Tensor, response: Tensor
