@@ -27,6 +27,7 @@ _WRONG = 2.0  # factor by which the width of the response and the background may
 _NO_RETURN = 0.01  # probability that chance gives a hot pixel its highest window
 _MOST = 0.2  # part of the pixels or bins: more are no defects, but another response or background
 _AROUND = 5  # side of the window whose median is usual
+_AT_ONCE = 1 << 20  # bins of all pixels that are tested at once: little memory
 _FEWEST = 4  # counts of a stuck bin: fewer are no proof
 
 
@@ -143,10 +144,9 @@ def _wrong(
     wrong = _dead(total, np.minimum(expected, around), total.size)
     bright = _above(total, _WRONG * expected, total.size)
     shape = shape / max(shape.sum(), 1e-12)
-    rows = (
-        zip(wrong, counts, expected, bright, strict=True) if counts.ndim == 3 else [(wrong, counts, expected, bright)]
-    )
-    for part, some, level, chosen in rows:  # so that little memory is needed
+    parts = -(-counts.size // _AT_ONCE)
+    given = (np.array_split(one, parts) for one in (wrong, counts, expected, bright))
+    for part, some, level, chosen in zip(*given, strict=True):
         part |= _stuck(some, most, total.size).any(axis=-1)
         part[chosen] |= _hot(some[chosen], level[chosen, None] * shape, total.size, width)
     return wrong

@@ -70,14 +70,6 @@ def checked_gate(gate: tuple[float, float]) -> tuple[float, float]:
     return start, stop
 
 
-def checked_profile(profile: ArrayLike) -> NDArray[np.float64]:
-    """Backscatter over the gate, `[bins]`. Raises `ArgumentError`."""
-    bins = real_array("profile", profile, np.float64)
-    if bins.ndim != 1 or not (np.isfinite(bins).all() and (bins >= 0).all() and bins.sum() > 0):
-        raise ArgumentError(f"profile has shape {bins.shape}; [bins] of numbers >= 0 that are not all 0 is needed")
-    return bins
-
-
 def depth_values(depth: ArrayLike) -> NDArray[np.float32]:
     """Depth as float32, NaN where a masked array is masked. Raises `ArgumentError` for what is no array of numbers."""
     values = np.ma.asanyarray(on_host(depth))
@@ -129,7 +121,9 @@ def depth_frames(
             raise ArgumentError(f"density has shape {np.shape(density)}; {values.shape} is needed, of numbers >= 0")
         relative = np.nan_to_num(given * np.float32(stop - start), nan=1.0)
     elif profile is not None:
-        bins = checked_profile(profile)
+        bins = real_array("profile", profile, np.float64)
+        if bins.ndim != 1 or not (np.isfinite(bins).all() and (bins >= 0).all() and bins.sum() > 0):
+            raise ArgumentError(f"profile has shape {bins.shape}; [bins] of numbers >= 0, not all 0, is needed")
         index = np.nan_to_num((values - start) / (stop - start)) * bins.size
         relative = (bins / bins.mean())[np.clip(index.astype(np.int64), 0, bins.size - 1)].astype(np.float32)
     return DepthFrames(depth=values, gate=(start, stop), density=relative)

@@ -9,6 +9,7 @@ how much the photons of others tell, where depth jumps, and what light is of no 
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from functools import partial, reduce
 from itertools import pairwise
 from typing import Any
@@ -24,6 +25,7 @@ CELL = 4
 """Bins of a cell."""
 
 _MANY = 256  # images of a convolution
+_AT_ONCE = 1 << 20  # values of a layer that are computed at once: they stay in the cache of a CPU
 
 CLOSE = 0.01
 """A depth this near to the truth is right [gate widths]."""
@@ -104,6 +106,12 @@ class _Convolution(torch.autograd.Function):
         return by_image, by_filters, outside.sum(dim=(0, 1), dtype=torch.float32).to(filters.dtype)
 
 
+def _at_once(x: Tensor) -> int:
+    """How many cells of features `[B, N, H, W, n]` are computed at once, an even number; all of them in training."""
+    count = x.shape[1]
+    return count if torch.is_grad_enabled() else 2 * max(1, _AT_ONCE * count // (2 * x.numel()))
+
+
 class _Conv(nn.Conv3d):
     """Convolution over cells, rows and columns `[B, N, H, W, n]`, by one over rows and columns of which cells beside
     each other are channels: several times faster, on a GPU too, than one over three dimensions."""
@@ -112,9 +120,14 @@ class _Conv(nn.Conv3d):
         super().__init__(before, after, (3, 3, length))
 
     def forward(self, x: Tensor) -> Tensor:
-        if self.kernel_size[2] == 3:
-            x = F.pad(x, (0, 0, 0, 0, 0, 0, 1, 1))
-            x = torch.cat([x[:, :-2], x[:, 1:-1], x[:, 2:]], dim=-1)
+        if self.kernel_size[2] == 1:
+            return self._convolved(x)
+        count, step, x = x.shape[1], _at_once(x), F.pad(x, (0, 0, 0, 0, 0, 0, 1, 1))
+        beside = zip(*(x[:, first : first + count].split(step, dim=1) for first in range(3)), strict=True)
+        found = [self._convolved(torch.cat(cells, dim=-1)) for cells in beside]
+        return found[0] if len(found) == 1 else torch.cat(found, dim=1)
+
+    def _convolved(self, x: Tensor) -> Tensor:
         filters, bias = self.weight.permute(0, 4, 1, 2, 3).flatten(1, 2), self.bias
         image, device = x.flatten(0, 1).permute(0, 3, 1, 2), x.device.type
         kind = torch.get_autocast_dtype(device) if torch.is_autocast_enabled(device) else x.dtype
@@ -175,17 +188,20 @@ class _Pyramid(nn.Module):
         self.deep = _Residual(widths[-1], length)
         self.up = nn.ModuleList(_Enlarge(narrow, wide, side) for wide, narrow in pairs)
         self.after = nn.ModuleList(_Residual(width, length if level else 1) for level, width in enumerate(widths[:-1]))
-        self.stride = 2 ** len(pairs)
+        self.stride, self.side = 2 ** len(pairs), side
 
-    def forward(self, x: Tensor) -> Tensor:
+    def forward(self, parts: list[Tensor]) -> Iterator[Tensor]:
+        """Features of the first level in parts of an even number of cells: there, none sees the cells beside it."""
+        x = self.before[0](torch.cat([self.down[0](F.relu(part)) for part in parts], dim=1))
         skipped = []
-        for down, before in zip(self.down, self.before, strict=True):
+        for down, before in zip(self.down[1:], self.before[1:], strict=True):
             skipped.append(x)
             x = before(down(F.relu(x)))
         x = self.deep(x)
-        for up, after, skip in reversed(list(zip(self.up, self.after, skipped, strict=True))):
+        for up, after, skip in reversed(list(zip(self.up[1:], self.after[1:], skipped, strict=True))):
             x = after(skip + up(F.relu(x)))
-        return F.relu(x)
+        some = x.split(parts[0].shape[1] // self.side, dim=1)
+        return (F.relu(self.after[0](parts.pop(0) + self.up[0](F.relu(x)))) for x in some)
 
 
 class HistogramNet(nn.Module):
@@ -233,10 +249,18 @@ class HistogramNet(nn.Module):
     def _weighed(self, cells: Tensor, images: Tensor) -> tuple[Tensor, Tensor]:
         """Logarithms of weights, and the prior, of each cell `[B, N, H, W, n]`; the target's logit `[B, H, W]`."""
         image = self.enter_image(images).permute(0, 2, 3, 1)[:, None]
-        x = self.pyramid(self.enter(cells.permute(0, 4, 2, 3, 1).contiguous()) + image)
-        ends = x.amax(dim=1, keepdim=True), x.mean(dim=1, keepdim=True), images.permute(0, 2, 3, 1)[:, None]
-        target = self.target_pyramid(self.enter_target(torch.cat(ends, dim=-1)))
-        return self.head(x), self.target(target)[:, 0, ..., 0]
+        cells, count = cells.permute(0, 4, 2, 3, 1), cells.shape[-1]
+        at_once = _at_once(image.expand(-1, count, -1, -1, -1))
+        parts = [self.enter(part.contiguous()) + image for part in cells.split(at_once, dim=1)]
+        found = [(self.head(x), x.amax(dim=1, keepdim=True), x.sum(dim=1, keepdim=True)) for x in self.pyramid(parts)]
+        heads, most, sums = (torch.cat(each, dim=1) for each in zip(*found, strict=True))
+        ends = (
+            most.amax(dim=1, keepdim=True),
+            sums.sum(dim=1, keepdim=True) / count,
+            images.permute(0, 2, 3, 1)[:, None],
+        )
+        (target,) = self.target_pyramid([self.enter_target(torch.cat(ends, dim=-1))])
+        return heads, self.target(target)[:, 0, ..., 0]
 
     def _seen(
         self, volumes: list[Tensor], tops: list[Tensor], counts: Tensor, background: Tensor, response: Tensor

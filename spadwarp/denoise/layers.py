@@ -172,7 +172,7 @@ class SymmetricConv(nn.Module):
 
     def expanded(self) -> Tensor:
         """The filters of an ordinary convolution, `[8 outputs, inputs, size, size]`."""
-        if self._kept is not None and not torch.is_grad_enabled() and self._kept.device == self.weight.device:
+        if self._kept is not None and not torch.is_grad_enabled():
             return self._kept
         assert isinstance(self.places, Tensor) and isinstance(self.inverse, Tensor)
         outputs, inputs = self.weight.shape[:2]
@@ -184,17 +184,9 @@ class SymmetricConv(nn.Module):
         self._kept = filters.detach().contiguous(memory_format=torch.channels_last)
         return self._kept
 
-    def train(self, mode: bool = True) -> SymmetricConv:
+    def train(self, mode: bool = True) -> SymmetricConv:  # called before a network with new weights answers
         self._kept = None
         return super().train(mode)
-
-    def _apply(self, *arguments: Any, **options: Any) -> SymmetricConv:
-        self._kept = None
-        return super()._apply(*arguments, **options)
-
-    def _load_from_state_dict(self, *arguments: object) -> None:
-        self._kept = None
-        super()._load_from_state_dict(*arguments)  # type: ignore[arg-type]
 
     def forward(self, x: Tensor) -> Tensor:
         bias = None if self.bias is None else self.bias[:, None].expand(-1, GROUP).flatten()

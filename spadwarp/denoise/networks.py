@@ -21,7 +21,6 @@ from torch import Tensor, nn
 
 from spadwarp.denoise.histogram_network import HistogramNet, filled_up
 from spadwarp.denoise.layers import GROUP, SymmetricConv, SymmetricWindow, edge_padded, enlarged, turned
-from spadwarp.values import ArgumentError
 
 
 class USDN(nn.Module):
@@ -388,7 +387,5 @@ NETWORKS: dict[str, Callable[[], nn.Module]] = {
 
 
 def build_network(name: str) -> nn.Module:
-    """A network with new weights; raises ArgumentError for a name that is not in `NETWORKS`."""
-    if name not in NETWORKS:
-        raise ArgumentError(f"model = {name!r} is not one of {', '.join(map(repr, NETWORKS))}")
+    """A network of `NETWORKS` with new weights."""
     return NETWORKS[name]()

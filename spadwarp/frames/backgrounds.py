@@ -155,12 +155,12 @@ def _opening(seen: NDArray[np.float64], expected: NDArray[np.float64]) -> NDArra
 
 def _blocks(frames: NDArray[Any]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """Counts of blocks of pixels `[blocks, T]`, and how many pixels each has."""
-    height, width = frames.shape[1:3]
-    rows, columns = np.arange(0, height, _BLOCK), np.arange(0, width, _BLOCK)
-    sums = np.add.reduceat(frames, rows, axis=1, dtype=np.float64)
-    sums = np.add.reduceat(sums, columns, axis=2)
-    sizes = np.outer(np.diff([*rows, height]), np.diff([*columns, width])).ravel()
-    return sums.reshape(-1, frames.shape[-1]), np.tile(sizes, len(frames)).astype(np.float64)
+    sizes = np.outer(*(np.minimum(_BLOCK, side - np.arange(0, side, _BLOCK)) for side in frames.shape[1:3]))
+    sums = np.zeros((len(frames), *sizes.shape, frames.shape[-1]))
+    for row, column in np.ndindex(_BLOCK, _BLOCK):  # many times faster than reduceat
+        some = frames[:, row::_BLOCK, column::_BLOCK]
+        sums[:, : some.shape[1], : some.shape[2]] += some
+    return sums.reshape(-1, frames.shape[-1]), np.tile(sizes.ravel(), len(frames)).astype(np.float64)
 
 
 def return_width(response: ArrayLike | float) -> int:
