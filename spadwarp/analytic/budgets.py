@@ -13,7 +13,8 @@ from typing import Any
 
 import numpy as np
 
-from spadwarp.analytic.model import Map, false_peaks, pixel_maps, response_sigma, warn_of_model
+from spadwarp.analytic.model import false_peaks, pixel_maps, response_sigma, warn_of_model
+from spadwarp.arrays import Floats
 from spadwarp.result import Truth
 from spadwarp.scene import Scene, SceneLike, as_scene
 from spadwarp.scene.camera import pixel_directions
@@ -115,7 +116,7 @@ def central_pixel(scene: Scene, truth: Truth) -> tuple[Any, ...]:
 
 
 def axis_rows(
-    scene: Scene, name: str | None, distances: Map, reflectance: float, device: str | None
+    scene: Scene, name: str | None, distances: Floats, reflectance: float, device: str | None
 ) -> list[BudgetRow]:
     """A row for each distance on the optical axis [m], for the scene's water of that name."""
     gate = (scene.gate.start, scene.gate.stop)
@@ -171,7 +172,7 @@ def central_row(scene: Scene, device: str | None) -> BudgetRow:
     return axis_rows(scene, None, np.array([float(truth.range[pixel])]), float(truth.reflectance[pixel]), device)[0]
 
 
-def _distances(scene: Scene, ranges: Any) -> Map:
+def _distances(scene: Scene, ranges: Any) -> Floats:
     lead = float(axis_line(scene).lead[0])
     if ranges is None:
         return np.array([x for x in _RANGES if x > lead] or [lead + x for x in _RANGES])
@@ -184,7 +185,7 @@ def _distances(scene: Scene, ranges: Any) -> Map:
     return np.array(distances)
 
 
-def _pulses_needed(scene: Scene, maps: Mapping[str, Map], background: Map, gate: float, device: str | None) -> Map:
+def _pulses_needed(scene: Scene, maps: Mapping[str, Floats], background: Floats, gate: float, device: Any) -> Floats:
     """Pulses until the bound of depth is within `TOLERANCE` and outliers are rarer than `OUTLIERS`; bisects ln N."""
     chosen, alpha = scene.analytic, maps["alpha"]
     per_acquisition = 1.0 if chosen.count_law == "per_pulse" else chosen.exposure * scene.laser.repetition_rate

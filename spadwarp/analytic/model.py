@@ -22,6 +22,7 @@ import warp as wp
 from numpy.typing import ArrayLike, NDArray
 
 import spadwarp_kernels as sk
+from spadwarp.arrays import Floats
 from spadwarp.device import pick_device
 from spadwarp.frames.response import FWHM_PER_SIGMA
 from spadwarp.scene import Scene, daylight_rate, phase_function, water_lines
@@ -34,8 +35,6 @@ from spadwarp.transport.model import port_kind, port_parameters
 from spadwarp.values import ArgumentError, ConfigError, SpadwarpWarning
 
 __all__ = ["model_notes", "pixel_maps"]
-
-Map = NDArray[np.float64]
 
 
 class BackscatterTable(NamedTuple):
@@ -73,7 +72,7 @@ def pixel_maps(
     backscatter_profile: NDArray[np.float32] | None = None,
     gate: tuple[float, float] | None = None,
     outliers: bool = True,
-) -> tuple[dict[str, Map], BackscatterTable]:
+) -> tuple[dict[str, Floats], BackscatterTable]:
     """The model's maps for any lines of sight, by name as in `AnalyticResult`, and the table of backscatter over path.
 
     Args:
@@ -167,7 +166,7 @@ def scene_optics(scene: Scene) -> tuple[Any, Any]:
     return sk.make_optics(port_kind(camera), port_kind(laser), rough=slope > 0.0), ports
 
 
-def false_peaks(signal: ArrayLike, level: ArrayLike, lengths: ArrayLike, device: Any = None) -> Map:
+def false_peaks(signal: ArrayLike, level: ArrayLike, lengths: ArrayLike, device: Any = None) -> Floats:
     """Probability that a maximum-likelihood fit takes background for the return: from recorded photons of the return,
     and of background per standard deviation of the response, and the gate's length in these."""
     target, columns = pick_device(device), (signal, level, lengths)
@@ -178,7 +177,7 @@ def false_peaks(signal: ArrayLike, level: ArrayLike, lengths: ArrayLike, device:
 class _Model:
     """A scene and lines of sight as the kernels take them. Raises `ConfigError` for what the model does not cover."""
 
-    def __init__(self, scene: Scene, views: Map, distances: Map, device: Any, start: float, stop: float) -> None:
+    def __init__(self, scene: Scene, views: Floats, distances: Floats, device: Any, start: float, stop: float) -> None:
         if problems := [text for text, is_met in _not_covered(scene).items() if is_met]:
             raise ConfigError(problems, source=scene.source)
         self.scene, self.device, self.lines = scene, device, water_lines(scene)
@@ -205,11 +204,11 @@ class _Model:
         lines = zip(self.lines, scattering, strict=True)
         return self.on_device([(self.lidar.photons * line.share, line.extinction, b) for line, b in lines])
 
-    def signal(self, normal: ArrayLike, reflectance: ArrayLike) -> tuple[Map, Map]:
+    def signal(self, normal: ArrayLike, reflectance: ArrayLike) -> tuple[Floats, Floats]:
         """S, summed over the lines, and the mean arrival time of their photons, `[P]`."""
         lidar, surfaces = self.lidar, [*self.sights, self.on_device(normal), self.on_device(reflectance)]
         whole = (lidar.photons, lidar.extinction, lidar.speed)
-        parts: list[tuple[Map, Map]] = []
+        parts: list[tuple[Floats, Floats]] = []
         for line in self.lines:
             lidar.photons, lidar.extinction, lidar.speed = whole[0] * line.share, line.extinction, line.speed
             signal, arrival = sk.signal_map(lidar, *surfaces, optics=self.optics)
@@ -222,7 +221,7 @@ class _Model:
         shares = [np.divide(signal, total, out=even.copy(), where=total > 0) for signal, _ in parts]
         return total, np.sum([share * time for share, (_, time) in zip(shares, parts, strict=True)], axis=0)
 
-    def backscatter(self, profile: NDArray[np.float32] | None) -> tuple[Map, BackscatterTable, NDArray[np.float32]]:
+    def backscatter(self, profile: NDArray[np.float32] | None) -> tuple[Floats, BackscatterTable, NDArray[np.float32]]:
         """Detections per pulse in the gate, their table, and their profile if the model takes one."""
         lidar, chosen, speed = self.lidar, self.scene.analytic, self.scene.medium.pulse_speed
         gate, empty = (lidar.start, lidar.stop), np.zeros((1, 1), np.float32)
@@ -316,7 +315,7 @@ def _lidar(scene: Scene, start: float, stop: float) -> tuple[Any, Any]:
 _PIECES, _LINES = 400, 256
 
 
-def passed_by_grid(scene: Scene, views: Map, distances: Map) -> Map:
+def passed_by_grid(scene: Scene, views: Floats, distances: Floats) -> Floats:
     """Part of the light that passes the cells on its way from the laser to points and on to the lens, over what passes
     the medium without cells; exact for the cells. Views `[P, 3]` and distances `[P]` [m] as in `pixel_maps`."""
     cells, c = grid_cells(scene.medium), scene.medium.extinction
@@ -331,7 +330,7 @@ def passed_by_grid(scene: Scene, views: Map, distances: Map) -> Map:
     return np.exp(-depth)
 
 
-def _begin_of_light(scene: Scene, sights: LinesOfSight, points: Map) -> Map:
+def _begin_of_light(scene: Scene, sights: LinesOfSight, points: Floats) -> Floats:
     """Where the laser's light to points `[P, 3]` enters the water, or is emitted in it [m]; NaN where there is no
     way."""
     beam, port = scene.beam, laser_port(scene)
@@ -349,10 +348,10 @@ def _begin_of_light(scene: Scene, sights: LinesOfSight, points: Map) -> Map:
 
 def grid_backscatter(
     scene: Scene,
-    views: Map,
+    views: Floats,
     paths: NDArray[np.float32],
     cumulative: NDArray[np.float32],
-    total: Map,
+    total: Floats,
     gate: tuple[float, float],
 ) -> NDArray[np.float32]:
     """Detections per pulse and bin of light scattered once, `[P, T]`.
@@ -377,8 +376,8 @@ def _part(
     sights: LinesOfSight,
     paths: NDArray[np.float32],
     cumulative: NDArray[np.float32],
-    edges: Map,
-) -> Map:
+    edges: Floats,
+) -> Floats:
     """The same for a total of 1, for some lines of sight and edges of bins in path [m]."""
     medium = scene.medium
     # Length in the water up to where the way by the laser has the longest path.
@@ -410,6 +409,6 @@ def _part(
     return result
 
 
-def _henyey_greenstein(cosine: Map, g: Map | float) -> Map:
+def _henyey_greenstein(cosine: Floats, g: Floats | float) -> Floats:
     """The phase function without its factor 1/4π."""
     return (1.0 - np.square(g)) / (1.0 + np.square(g) - 2.0 * g * cosine) ** 1.5

@@ -616,11 +616,11 @@ def _refuse_hopeless(scene: Scene, nearest: float, time: float) -> None:
         )
 
 
-def _rounded_down(value: float, digits: int = 3) -> float:
-    """With so many digits, not above the value."""
-    text = f"{value:.{digits - 1}e}"
-    step = 10.0 ** (int(text.partition("e")[2]) - digits + 1)
-    return float(f"{float(text) - (step if float(text) > value else 0.0):.{digits}g}")
+def _rounded_down(value: float) -> float:
+    """With three digits, not above the value."""
+    nearest = f"{value:.2e}"
+    step = 10.0 ** (int(nearest.partition("e")[2]) - 2) * (float(nearest) > value)
+    return float(f"{float(nearest) - step:.3g}")
 
 
 def _pulses_without_false_peaks(scene: Scene, pilot: Pilot, device: str | None) -> float:

@@ -12,8 +12,8 @@ import warp as wp
 from numpy.typing import ArrayLike, NDArray
 
 import spadwarp_kernels as sk
-from spadwarp.analytic.model import BackscatterTable, Map, pixel_maps, response_sigma, scene_optics, warn_of_model
-from spadwarp.arrays import labelled, real_array
+from spadwarp.analytic.model import BackscatterTable, pixel_maps, response_sigma, scene_optics, warn_of_model
+from spadwarp.arrays import Floats, labelled, real_array
 from spadwarp.device import pick_device
 from spadwarp.io.hdf5 import PACKED, PIXELS, Coordinate, image_coordinates, name_dimensions, read_hdf5, write_hdf5
 from spadwarp.result.file import as_result
@@ -82,18 +82,18 @@ class AnalyticResult(Shown):
 
     scene: Scene  # the scene
     truth: Truth  # depth, range, normal and reflectance that the maps come from
-    signal: Map  # S, expected detections of the return per pulse (eq 7); 0 without a return
-    arrival: Map  # μ [s] after the pulse left the laser; NaN where nothing is hit
-    backscatter: Map  # expected backscatter detections per pulse within the gate
-    daylight: Map  # detections of daylight [1/s]; 0 without `[daylight]`
-    alpha: Map  # α, all expected detections per pulse within the gate (integral of eq 8)
-    fisher: Map  # F, information on the delay per detected photon [1/s²] (eq 9); 0 where there is no estimate
-    sigma_time: Map  # σ* = 1/√(N·F) [s], the Cramér–Rao bound of one depth frame, N being its recorded photons
-    sigma_depth: Map  # the bound of planar depth [m]
-    signal_to_backscatter: Map  # both per pulse within the gate; infinite where there is no backscatter
-    background_level: Map  # background detections per pulse and σ of the response, under the return
-    outlier_probability: Map  # of a false peak: a fit takes background for the return, `sigma_time` is not reached
-    background_probability: Map  # that a frame's pixel reports a background photon
+    signal: Floats  # S, expected detections of the return per pulse (eq 7); 0 without a return
+    arrival: Floats  # μ [s] after the pulse left the laser; NaN where nothing is hit
+    backscatter: Floats  # expected backscatter detections per pulse within the gate
+    daylight: Floats  # detections of daylight [1/s]; 0 without `[daylight]`
+    alpha: Floats  # α, all expected detections per pulse within the gate (integral of eq 8)
+    fisher: Floats  # F, information on the delay per detected photon [1/s²] (eq 9); 0 where there is no estimate
+    sigma_time: Floats  # σ* = 1/√(N·F) [s], the Cramér–Rao bound of one depth frame, N being its recorded photons
+    sigma_depth: Floats  # the bound of planar depth [m]
+    signal_to_backscatter: Floats  # both per pulse within the gate; infinite where there is no backscatter
+    background_level: Floats  # background detections per pulse and σ of the response, under the return
+    outlier_probability: Floats  # of a false peak: a fit takes background for the return, `sigma_time` is not reached
+    background_probability: Floats  # that a frame's pixel reports a background photon
     depth: NDArray[np.float32]  # frames, float32 `[N, H, W]` [m]; NaN for no estimate
     labels: NDArray[np.bool_]  # bool `[N, H, W]`, where a frame's pixel reports a background photon
     seed: int  # of the frames
@@ -275,7 +275,7 @@ def simulate_analytic(
     return replace(result, depth=depth, labels=labels)
 
 
-def _background(scene: Scene, maps: dict[str, Map]) -> tuple[Map, Map]:
+def _background(scene: Scene, maps: dict[str, Floats]) -> tuple[Floats, Floats]:
     """Probability that a pixel reports a background photon, and the part of these that is flat over the gate."""
     fraction, estimated = scene.analytic.backscatter_fraction, maps["fisher"] > 0
     if fraction is None:

@@ -377,7 +377,7 @@ def _blended(cube: Cube, windows: Any, arounds: Any, device: wp.Device) -> tuple
     for reach in arounds:
         sk.window_sums(risk, reach, work, near)
         mean = near.numpy()
-        # One standard error more than the halves show. A window holds its own voxel: differences of float32 leave less.
+        # One standard error more than the halves show. A window holds its own voxel; rounding may leave less.
         more = np.maximum(mean[..., 0] + np.sqrt(np.maximum(mean[..., 3], 0.0)), 0.0)
         bias = np.maximum(bias, more * own[..., 2] / np.maximum(np.maximum(mean[..., 2], own[..., 2]), 1e-30))
-    return 0.5 * np.maximum(found[..., 0] + found[..., 1], 0.0), own[..., 1] + bias  # float32 may end below 0
+    return 0.5 * np.maximum(found[..., 0] + found[..., 1], 0.0), own[..., 1] + bias  # rounding may end below 0

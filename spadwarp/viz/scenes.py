@@ -11,8 +11,8 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.cm import ScalarMappable
 from matplotlib.colors import LinearSegmentedColormap, Normalize, to_rgb
-from numpy.typing import NDArray
 
+from spadwarp.arrays import Floats
 from spadwarp.dataset import FrameReader
 from spadwarp.dataset.recipe import SPLITS
 from spadwarp.mesh import SIZED_BUILTINS, MeshSummary, TriangleMesh, build_mesh, builtin_names, make_builtin
@@ -26,8 +26,6 @@ from spadwarp.viz import style
 from spadwarp.viz.style import BOUND_MAP, DEPTH_MAP, INTENSITY_MAP, PAGE, PaperFigure, coloured_depth, paper, save
 
 __all__ = ["describe_targets", "draw_dataset", "draw_mesh", "draw_targets", "draw_water"]
-
-Floats = NDArray[np.float64]
 
 _STEPS = 400  # of the longer side
 # Without cells the densest water may be everywhere: lines and the targets must show on it.

@@ -128,7 +128,7 @@ LINES = {
     "scene": (3700, 5215),
     "transport": (2300, 3410),
     "validate": (750, 794),
-    "viz": (2200, 2541),
+    "viz": (2200, 2539),
     "water": (800, 848),
     "kernels/spadwarp_kernels": (50, 50),
     "kernels/analytic": (1650, 1676),
