@@ -1,10 +1,11 @@
-"""Compiles the CPU kernels of common runs into kernels/spadwarp_kernels/compiled.zip, which goes into the wheel.
+"""Compiles the kernels of common runs into kernels/spadwarp_kernels/compiled.zip, which goes into the wheel.
 
 python .ci/compile_kernels.py
 
-With both packages installed, on Linux x86-64, before the wheels are built. The scenes that come with the package are
-run with both estimators, their counts drawn and their depth estimated; one is reconstructed; a camera for simulators is
-run. Warp compiles for `x86-64-v3` meanwhile, and keeps the objects under the names that it looks for later.
+With both packages installed, on Linux x86-64, before the wheels are built; no GPU is needed. The scenes that come with
+the package are run with both estimators on the CPU, their counts drawn and their depth estimated; one is reconstructed;
+a camera for simulators is run. Warp compiles for `x86-64-v3` meanwhile, and keeps the objects under the names that it
+looks for later. For GPUs the same kernels are compiled to PTX, with the transport kernels that these scenes take there.
 """
 
 import contextlib
@@ -20,8 +21,11 @@ import warp._src.build
 
 import spadwarp
 import spadwarp_kernels as sk
-from spadwarp.io import paths as examples
+from spadwarp.io.paths import examples
 from spadwarp_kernels.base import kernels as compiled
+from spadwarp_kernels.photon.queue import BLOCK_SIZE
+from spadwarp_kernels.surface import bvh, patches
+from spadwarp_kernels.transport import launch
 
 
 def compile_for_target() -> None:
@@ -34,6 +38,34 @@ def compile_for_target() -> None:
         return build(*args, extra_flags=flags, **options)
 
     warp._src.build.build_cpu = build_for_target
+
+
+class Launched:
+    """The kernels that are launched from now on, as a GPU would take them: modules, and the threads of a block."""
+
+    def __init__(self) -> None:
+        self.modules: dict[wp.Module, int] = {}
+        self._on_cpu: set[wp.Module] = set()  # of transport kernels, which GPUs have of their own
+        self._launch, self._make = wp.launch, launch.make_transport_kernel
+        wp.launch, launch.make_transport_kernel = self._record, self._record_transport
+
+    def _record(self, kernel: wp.Kernel, *args: Any, block_dim: int = 256, **options: Any) -> Any:
+        if kernel.module not in self._on_cpu:
+            self.modules[kernel.module] = block_dim
+        return self._launch(kernel, *args, block_dim=block_dim, **options)
+
+    def _record_transport(self, spec: sk.TransportSpec, cuda: bool = False) -> wp.Kernel:
+        kernel = self._make(spec, cuda)
+        self._on_cpu.add(kernel.module)
+        self.modules[self._make(spec, True).module] = BLOCK_SIZE
+        return kernel
+
+    def compile(self) -> None:
+        for module in (bvh, patches):  # which only GPUs have
+            self.modules[wp.get_module(module.__name__)] = 256
+        for module, block_dim in self.modules.items():
+            module.options["block_dim"] = block_dim
+            wp.compile_aot_module(module, arch=compiled.GPU, use_ptx=True)
 
 
 def run_common() -> None:
@@ -67,9 +99,9 @@ def run_cameras() -> None:
 def pack(cache: Path) -> None:
     with zipfile.ZipFile(compiled.ARCHIVE, "w", zipfile.ZIP_DEFLATED, compresslevel=9) as archive:
         archive.writestr(compiled.MANIFEST, json.dumps(compiled.this_system()))
-        for path in sorted(cache.glob("*/*.o")):
-            module = re.sub(r"\.cpu[0-9a-f]+\.o$", "", path.name)
-            archive.write(path, f"{module}.o")
+        for path in sorted([*cache.glob("*/*.o"), *cache.glob("*/*.ptx")]):
+            module = re.sub(r"\.(cpu[0-9a-f]+|sm[0-9]+)$", "", path.stem)
+            archive.write(path, f"{module}{path.suffix}")
             archive.write(path.with_name(f"{module}.meta"), f"{module}.meta")
     size = compiled.ARCHIVE.stat().st_size
     print(f"{compiled.ARCHIVE}: {len(archive.namelist()) // 2} modules, {size / 2**20:.2f} MiB")
@@ -80,8 +112,10 @@ def main() -> None:
     with tempfile.TemporaryDirectory() as cache:
         wp.config.kernel_cache_dir = cache
         compile_for_target()
+        launched = Launched()
         run_common()
         run_cameras()
+        launched.compile()
         pack(Path(wp.config.kernel_cache_dir))
 
 

@@ -9,7 +9,7 @@ import secrets
 import threading
 import zipfile
 import zlib
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Collection, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import Any, ParamSpec, TypeVar
@@ -78,7 +78,7 @@ def launch_pixels(
         list(pool.map(launch, edges, edges[1:]))
 
 
-# ---- Kernels that were compiled when the package was built: a first run then compiles nothing on common CPUs.
+# ---- Kernels that were compiled when the package was built: a first run then compiles nothing on common CPUs and GPUs.
 
 
 # Made by .ci/compile_kernels.py; a checkout has none.
@@ -89,6 +89,8 @@ TARGET = "x86-64-v3"
 """The processors whose instructions the objects use: Intel since 2013 and AMD since 2017, but for the smallest."""
 FEATURES = ("avx", "avx2", "bmi1", "bmi2", "f16c", "fma", "abm", "movbe")
 """These instructions by their names in /proc/cpuinfo."""
+GPU = 75
+"""The oldest GPUs that Warp compiles for: newer ones run what was compiled for them, too."""
 
 # An archive that is damaged, or a cache that cannot be written: kernels are then compiled as without it.
 _UNUSABLE = (OSError, RuntimeError, ValueError, KeyError, zipfile.BadZipFile, zlib.error)
@@ -100,18 +102,28 @@ def unpack_kernels() -> int:
     For programs of their own, before their first kernel; `spadwarp` calls it.
 
     Returns:
-        The number of modules added: 0 where the package has none for this version of Warp, system and processor, and
-        where it is damaged or the cache cannot be written.
+        The number of modules added: 0 where the package has none for this version of Warp, system, processor and
+        GPUs, and where it is damaged or the cache cannot be written.
     """
     if not ARCHIVE.exists():
         return 0
     wp.init()
     with contextlib.suppress(*_UNUSABLE), zipfile.ZipFile(ARCHIVE) as archive:
-        if this_system() == json.loads(archive.read(MANIFEST)) and set(FEATURES) <= _processor_features():
-            # The end of this key is what Warp adds to the names of objects for the processor at hand.
-            ending = "cpu" + wp.get_cpu_kernel_cache_key().rpartition("-")[2]
-            return sum(_unpack(archive, name, ending) for name in archive.namelist() if name.endswith(".o"))
+        if this_system() == json.loads(archive.read(MANIFEST)):
+            endings = _endings()
+            return sum(_unpack(archive, Path(name), endings.get(Path(name).suffix, ())) for name in archive.namelist())
     return 0
+
+
+def _endings() -> dict[str, set[str]]:
+    """What Warp adds to the name of a module that is compiled for the processor, and for the GPUs at hand."""
+    endings = {".ptx": set[str]()}
+    if set(FEATURES) <= _processor_features():
+        endings[".o"] = {f"cpu{wp.get_cpu_kernel_cache_key().rpartition('-')[2]}.o"}
+    for device in wp.get_cuda_devices():
+        if device.get_cuda_output_format() == "ptx":  # a driver older than Warp's compiler cannot read it
+            endings[".ptx"].add(f"sm{device.get_cuda_compile_arch()}.ptx")
+    return endings
 
 
 def this_system() -> dict[str, str]:
@@ -124,13 +136,14 @@ def _processor_features() -> set[str]:
     return set(Path("/proc/cpuinfo").read_text(encoding="utf-8").split())
 
 
-def _unpack(archive: zipfile.ZipFile, name: str, ending: str) -> bool:
-    module = name.removesuffix(".o")
-    folder = Path(wp.config.kernel_cache_dir) / module
-    missing = [part for part in (f"{ending}.o", "meta") if not (folder / f"{module}.{part}").exists()]
-    for part in missing:
+def _unpack(archive: zipfile.ZipFile, name: Path, endings: Collection[str]) -> bool:
+    folder = Path(wp.config.kernel_cache_dir) / name.stem
+    missing = {ending: name.name for ending in endings if not (folder / f"{name.stem}.{ending}").exists()}
+    if endings and not (folder / f"{name.stem}.meta").exists():
+        missing["meta"] = f"{name.stem}.meta"
+    for ending, member in missing.items():
         folder.mkdir(parents=True, exist_ok=True)
         temporary = folder / f".{secrets.token_hex(8)}"
-        temporary.write_bytes(archive.read(f"{module}.{part.removeprefix(f'{ending}.')}"))
-        os.replace(temporary, folder / f"{module}.{part}")
+        temporary.write_bytes(archive.read(member))
+        os.replace(temporary, folder / f"{name.stem}.{ending}")
     return bool(missing)
