@@ -5,10 +5,12 @@ import functools
 import json
 import os
 import platform
+import re
 import secrets
 import threading
 import zipfile
 import zlib
+from collections import defaultdict
 from collections.abc import Callable, Collection, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
@@ -89,8 +91,9 @@ TARGET = "x86-64-v3"
 """The processors whose instructions the objects use: Intel since 2013 and AMD since 2017, but for the smallest."""
 FEATURES = ("avx", "avx2", "bmi1", "bmi2", "f16c", "fma", "abm", "movbe")
 """These instructions by their names in /proc/cpuinfo."""
-GPU = 75
-"""The oldest GPUs that Warp compiles for: newer ones run what was compiled for them, too."""
+PTX, CUBIN = 75, (80, 90, 100, 120)
+"""Compute capabilities. Drivers as new as Warp's compiler read PTX, for any GPU from this one on; older ones read only
+machine code, for GPUs of its own major version."""
 
 # An archive that is damaged, or a cache that cannot be written: kernels are then compiled as without it.
 _UNUSABLE = (OSError, RuntimeError, ValueError, KeyError, zipfile.BadZipFile, zlib.error)
@@ -110,19 +113,26 @@ def unpack_kernels() -> int:
     wp.init()
     with contextlib.suppress(*_UNUSABLE), zipfile.ZipFile(ARCHIVE) as archive:
         if this_system() == json.loads(archive.read(MANIFEST)):
-            endings = _endings()
-            return sum(_unpack(archive, Path(name), endings.get(Path(name).suffix, ())) for name in archive.namelist())
+            endings, members = _endings(), map(_MEMBER.fullmatch, archive.namelist())
+            return sum(_unpack(archive, found, endings[found["kind"]]) for found in members if found)
     return 0
 
 
-def _endings() -> dict[str, set[str]]:
-    """What Warp adds to the name of a module that is compiled for the processor, and for the GPUs at hand."""
-    endings = {".ptx": set[str]()}
+# Module and kind of what Warp has compiled.
+_MEMBER = re.compile(r"(?P<module>.+)\.(?P<kind>o|sm\d+\.ptx|sm\d+\.cubin)")
+
+
+def _endings() -> defaultdict[str, set[str]]:
+    """What Warp adds to the name of a module that it compiles here, by kinds of what is compiled already."""
+    endings = defaultdict[str, set[str]](set)
     if set(FEATURES) <= _processor_features():
-        endings[".o"] = {f"cpu{wp.get_cpu_kernel_cache_key().rpartition('-')[2]}.o"}
+        # The end of this key is what Warp adds to the names of objects for the processor at hand.
+        endings["o"].add(f"cpu{wp.get_cpu_kernel_cache_key().rpartition('-')[2]}.o")
     for device in wp.get_cuda_devices():
-        if device.get_cuda_output_format() == "ptx":  # a driver older than Warp's compiler cannot read it
-            endings[".ptx"].add(f"sm{device.get_cuda_compile_arch()}.ptx")
+        kind, arch = device.get_cuda_output_format(), device.get_cuda_compile_arch()
+        made = [PTX] if kind == "ptx" else [other for other in CUBIN if other // 10 == arch // 10 and other <= arch]
+        for other in made:
+            endings[f"sm{other}.{kind}"].add(f"sm{arch}.{kind}")
     return endings
 
 
@@ -136,14 +146,15 @@ def _processor_features() -> set[str]:
     return set(Path("/proc/cpuinfo").read_text(encoding="utf-8").split())
 
 
-def _unpack(archive: zipfile.ZipFile, name: Path, endings: Collection[str]) -> bool:
-    folder = Path(wp.config.kernel_cache_dir) / name.stem
-    missing = {ending: name.name for ending in endings if not (folder / f"{name.stem}.{ending}").exists()}
-    if endings and not (folder / f"{name.stem}.meta").exists():
-        missing["meta"] = f"{name.stem}.meta"
+def _unpack(archive: zipfile.ZipFile, found: re.Match[str], endings: Collection[str]) -> bool:
+    module = found["module"]
+    folder = Path(wp.config.kernel_cache_dir) / module
+    missing = {ending: found.string for ending in endings if not (folder / f"{module}.{ending}").exists()}
+    if endings and not (folder / f"{module}.meta").exists():
+        missing["meta"] = f"{module}.meta"
     for ending, member in missing.items():
         folder.mkdir(parents=True, exist_ok=True)
         temporary = folder / f".{secrets.token_hex(8)}"
         temporary.write_bytes(archive.read(member))
-        os.replace(temporary, folder / f"{name.stem}.{ending}")
+        os.replace(temporary, folder / f"{module}.{ending}")
     return bool(missing)
