@@ -4,6 +4,7 @@ import json
 import sys
 import zipfile
 from concurrent.futures import ThreadPoolExecutor
+from unittest.mock import Mock
 
 import pytest
 import warp as wp
@@ -22,8 +23,8 @@ def archive(tmp_path, monkeypatch):
     def make(features=compiled.FEATURES, **changed):
         with zipfile.ZipFile(tmp_path / "compiled.zip", "w") as file:
             file.writestr(compiled.MANIFEST, json.dumps({**compiled.this_system(), **changed}))
-            file.writestr("wp_module_0123456.o", b"object")
-            file.writestr("wp_module_0123456.meta", b"{}")
+            for ending in ("o", "sm75.ptx", "sm80.cubin", "sm90.cubin", "meta"):
+                file.writestr(f"wp_module_0123456.{ending}", b"{}")
         monkeypatch.setattr(compiled, "_processor_features", lambda: set(features))
 
     wp.init()
@@ -32,19 +33,34 @@ def archive(tmp_path, monkeypatch):
     return make
 
 
-def test_objects_have_the_names_that_warp_looks_for(archive, tmp_path):
+def test_compiled_kernels_have_the_names_that_warp_looks_for(archive, tmp_path, device):
     archive()
-    assert unpack_kernels() == 1
+    unpack_kernels()
 
     @wp.kernel(module="unique")
     def fill(values: wp.array(dtype=float)):
         values[wp.tid()] = 1.0
 
-    wp.launch(fill, dim=1, outputs=[wp.zeros(1, dtype=float, device="cpu")], device="cpu")
-    own, ours = sorted((tmp_path / "cache").glob("*/*.o"), key=lambda path: "module_0123456" in path.name)
-    assert own.name.split(".")[1:] == ours.name.split(".")[1:]
-    assert ours.name.startswith("wp_module_0123456.") and ours.parent.name == "wp_module_0123456"
-    assert sorted(path.suffix for path in ours.parent.iterdir()) == [".meta", ".o"]  # and nothing temporary
+    wp.launch(fill, dim=1, outputs=[wp.zeros(1, dtype=float, device=device)], device=device)
+    ours = tmp_path / "cache" / "wp_module_0123456"
+    (own,) = (folder for folder in ours.parent.glob("wp_*fill*") if folder.is_dir())
+    own_names, our_names = (
+        {file.name.removeprefix(f"{folder.name}.") for file in folder.iterdir()} for folder in (own, ours)
+    )
+    sources = {"cpp", "cu"}
+    assert own_names - sources <= our_names  # what Warp has compiled is there, by the names it looks for
+    assert all(name == "meta" or name.endswith((".o", ".ptx", ".cubin")) for name in our_names)  # and nothing temporary
+
+
+def test_gpus_get_ptx_or_machine_code_as_their_driver_reads(archive, tmp_path, monkeypatch):
+    gpus = [("ptx", 80), ("ptx", 80), ("ptx", 120), ("cubin", 89), ("cubin", 90), ("cubin", 75)]
+    answers = ("get_cuda_output_format.return_value", "get_cuda_compile_arch.return_value")
+    made = [Mock(**dict(zip(answers, gpu, strict=True))) for gpu in gpus]
+    monkeypatch.setattr(wp, "get_cuda_devices", lambda: made)
+    archive(features=())
+    assert unpack_kernels() == 3
+    names = {path.name.partition(".")[2] for path in (tmp_path / "cache" / "wp_module_0123456").iterdir()}
+    assert names == {"sm80.ptx", "sm120.ptx", "sm89.cubin", "sm90.cubin", "meta"}
 
 
 def test_what_is_there_stays(archive, tmp_path):
@@ -56,7 +72,8 @@ def test_what_is_there_stays(archive, tmp_path):
 
 
 @pytest.mark.parametrize("changed", [{"warp": "1.0"}, {"system": "Plan9"}, {"machine": "vax"}, {"features": ("avx",)}])
-def test_an_archive_for_another_system_is_left_alone(archive, tmp_path, changed):
+def test_an_archive_for_another_system_is_left_alone(archive, tmp_path, monkeypatch, changed):
+    monkeypatch.setattr(wp, "get_cuda_devices", list)
     archive(**changed)
     assert unpack_kernels() == 0 and not (tmp_path / "cache").exists()
 

@@ -5,11 +5,13 @@ import functools
 import json
 import os
 import platform
+import re
 import secrets
 import threading
 import zipfile
 import zlib
-from collections.abc import Callable, Sequence
+from collections import defaultdict
+from collections.abc import Callable, Collection, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import Any, ParamSpec, TypeVar
@@ -78,7 +80,7 @@ def launch_pixels(
         list(pool.map(launch, edges, edges[1:]))
 
 
-# ---- Kernels that were compiled when the package was built: a first run then compiles nothing on common CPUs.
+# ---- Kernels that were compiled when the package was built: a first run then compiles nothing on common CPUs and GPUs.
 
 
 # Made by .ci/compile_kernels.py; a checkout has none.
@@ -89,6 +91,9 @@ TARGET = "x86-64-v3"
 """The processors whose instructions the objects use: Intel since 2013 and AMD since 2017, but for the smallest."""
 FEATURES = ("avx", "avx2", "bmi1", "bmi2", "f16c", "fma", "abm", "movbe")
 """These instructions by their names in /proc/cpuinfo."""
+PTX, CUBIN = 75, (80, 90, 100, 120)
+"""Compute capabilities. Drivers as new as Warp's compiler read PTX, for any GPU from this one on; older ones read only
+machine code, for GPUs of its own major version."""
 
 # An archive that is damaged, or a cache that cannot be written: kernels are then compiled as without it.
 _UNUSABLE = (OSError, RuntimeError, ValueError, KeyError, zipfile.BadZipFile, zlib.error)
@@ -100,18 +105,35 @@ def unpack_kernels() -> int:
     For programs of their own, before their first kernel; `spadwarp` calls it.
 
     Returns:
-        The number of modules added: 0 where the package has none for this version of Warp, system and processor, and
-        where it is damaged or the cache cannot be written.
+        The number of modules added: 0 where the package has none for this version of Warp, system, processor and
+        GPUs, and where it is damaged or the cache cannot be written.
     """
     if not ARCHIVE.exists():
         return 0
     wp.init()
     with contextlib.suppress(*_UNUSABLE), zipfile.ZipFile(ARCHIVE) as archive:
-        if this_system() == json.loads(archive.read(MANIFEST)) and set(FEATURES) <= _processor_features():
-            # The end of this key is what Warp adds to the names of objects for the processor at hand.
-            ending = "cpu" + wp.get_cpu_kernel_cache_key().rpartition("-")[2]
-            return sum(_unpack(archive, name, ending) for name in archive.namelist() if name.endswith(".o"))
+        if this_system() == json.loads(archive.read(MANIFEST)):
+            endings, members = _endings(), map(_MEMBER.fullmatch, archive.namelist())
+            return sum(_unpack(archive, found, endings[found["kind"]]) for found in members if found)
     return 0
+
+
+# Module and kind of what Warp has compiled.
+_MEMBER = re.compile(r"(?P<module>.+)\.(?P<kind>o|sm\d+\.ptx|sm\d+\.cubin)")
+
+
+def _endings() -> defaultdict[str, set[str]]:
+    """What Warp adds to the name of a module that it compiles here, by kinds of what is compiled already."""
+    endings = defaultdict[str, set[str]](set)
+    if set(FEATURES) <= _processor_features():
+        # The end of this key is what Warp adds to the names of objects for the processor at hand.
+        endings["o"].add(f"cpu{wp.get_cpu_kernel_cache_key().rpartition('-')[2]}.o")
+    for device in wp.get_cuda_devices():
+        kind, arch = device.get_cuda_output_format(), device.get_cuda_compile_arch()
+        made = [PTX] if kind == "ptx" else [other for other in CUBIN if other // 10 == arch // 10 and other <= arch]
+        for other in made:
+            endings[f"sm{other}.{kind}"].add(f"sm{arch}.{kind}")
+    return endings
 
 
 def this_system() -> dict[str, str]:
@@ -124,13 +146,15 @@ def _processor_features() -> set[str]:
     return set(Path("/proc/cpuinfo").read_text(encoding="utf-8").split())
 
 
-def _unpack(archive: zipfile.ZipFile, name: str, ending: str) -> bool:
-    module = name.removesuffix(".o")
+def _unpack(archive: zipfile.ZipFile, found: re.Match[str], endings: Collection[str]) -> bool:
+    module = found["module"]
     folder = Path(wp.config.kernel_cache_dir) / module
-    missing = [part for part in (f"{ending}.o", "meta") if not (folder / f"{module}.{part}").exists()]
-    for part in missing:
+    missing = {ending: found.string for ending in endings if not (folder / f"{module}.{ending}").exists()}
+    if endings and not (folder / f"{module}.meta").exists():
+        missing["meta"] = f"{module}.meta"
+    for ending, member in missing.items():
         folder.mkdir(parents=True, exist_ok=True)
         temporary = folder / f".{secrets.token_hex(8)}"
-        temporary.write_bytes(archive.read(f"{module}.{part.removeprefix(f'{ending}.')}"))
-        os.replace(temporary, folder / f"{module}.{part}")
+        temporary.write_bytes(archive.read(member))
+        os.replace(temporary, folder / f"{module}.{ending}")
     return bool(missing)
