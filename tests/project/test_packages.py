@@ -132,7 +132,7 @@ LINES = {
     "water": (800, 848),
     "kernels/spadwarp_kernels": (50, 50),
     "kernels/analytic": (1650, 1676),
-    "kernels/base": (950, 1217),
+    "kernels/base": (950, 1241),
     "kernels/detection": (1000, 1434),
     "kernels/estimators": (1300, 1090),
     "kernels/optics": (1350, 2573),
