@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import ctypes
 import importlib.metadata
 import math
@@ -109,7 +110,10 @@ def _cache(problems: list[str]) -> dict[str, str]:
     except OSError as error:
         writable = "NO"
         problems.append(f"the kernel cache {folder} cannot be written ({error.strerror}): set WARP_CACHE_PATH")
-    size = sum(path.stat().st_size for path in folder.rglob("*") if path.is_file())
+    size = 0
+    for place, _, names in os.walk(folder):  # in which other processes rename folders meanwhile
+        with contextlib.suppress(FileNotFoundError):
+            size += sum(Path(place, name).stat().st_size for name in names)
     modules = sum(path.is_dir() for path in folder.glob("*"))
     return {"folder": str(folder), "holds": f"{modules} kernel modules, {size / 2**20:.1f} MiB", "writable": writable}
 
