@@ -133,8 +133,7 @@ def _list_examples(kind: str | None, name: str | None) -> None:
     if not found:
         hint = suggestion(name, [one for paths in known.values() for one in paths])
         wrong(f"{name!r} is not one of `spadwarp list {kind}`{hint}", "NAME")
-    for paths in found.values():
-        say(paths[name].read_text(encoding="utf-8").rstrip())
+    say("\n".join(paths[name].read_text(encoding="utf-8").rstrip() for paths in found.values()))
     write_json(found)
 
 

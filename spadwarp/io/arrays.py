@@ -20,7 +20,6 @@ __all__ = ["point_cloud", "read_exr", "read_npy", "read_npz", "write_array", "wr
 # Names in an EXR's header that are its own.
 _STRUCTURE = {"channels", "compression", "dataWindow", "displayWindow", "lineOrder", "pixelAspectRatio"}
 _STRUCTURE |= {"screenWindowCenter", "screenWindowWidth", "type"}
-_REAL = "biuf"  # kinds of NumPy's types of real numbers and booleans
 _LARGEST_IMAGE = 1 << 28  # values that are read
 _DEFLATE, _SMALL = 1100, 1 << 16  # no compression of EXR makes an image smaller by more than this, its header aside
 
@@ -115,15 +114,13 @@ def read_npy(path: str | Path, *, largest: int | None = None) -> NDArray[Any]:
     with reading(path), place.open("rb") as file:
         if file.read(4)[:2] == b"PK":
             raise FileError(f"{path}: a .npz archive, not a .npy file; write one array with numpy.save")
-        file.seek(0)
-        return _array(file, f"{path}:", place.stat().st_size, f"{_REAL}c", largest)
+        return _array(file, f"{path}:", place.stat().st_size, "biufc", largest)
 
 
 def read_npz(path: str | Path, *, names: Collection[str] | None = None, largest: int) -> dict[str, NDArray[Any]]:
     """Arrays of numbers of a `.npz` archive: all, or those that have one of the names; pickles are never loaded.
 
-    `largest`: allowed number of values of an array. Raises `FileError`: no such file, not a `.npz` archive, shorter
-    than a header says, of another type, or too large.
+    `largest`: allowed number of values of an array. Raises `FileError` as `read_npy` does.
     """
     place = existing_file(path)
     arrays: dict[str, NDArray[Any]] = {}
@@ -132,14 +129,14 @@ def read_npz(path: str | Path, *, names: Collection[str] | None = None, largest:
             name = info.filename.removesuffix(".npy")
             if names is None or name in names:
                 with archive.open(info) as file:
-                    if names is not None or _header(file)[1].kind in _REAL:
-                        arrays[name] = _array(file, f"{path}: {name}", info.file_size, _REAL, largest)
+                    if names is not None or _header(file)[2].kind in "biuf":
+                        arrays[name] = _array(file, f"{path}: {name}", info.file_size, "biuf", largest)
     return arrays
 
 
 def _array(file: Any, where: str, size: int, kinds: str, largest: int | None) -> NDArray[Any]:
     """The array of an open file of so many bytes, whose header is compared with them before anything is allocated."""
-    shape, kind = _header(file)
+    shape, _, kind = _header(file)
     values, available = math.prod(shape), size - file.tell()
     if kind.kind not in kinds:
         raise FileError(f"{where} holds {kind}; numbers are needed")
@@ -151,15 +148,11 @@ def _array(file: Any, where: str, size: int, kinds: str, largest: int | None) ->
     return np.lib.format.read_array(file, allow_pickle=False)
 
 
-def _header(file: Any) -> tuple[tuple[int, ...], np.dtype[Any]]:
-    """Shape and type of the array of an open file."""
+def _header(file: Any) -> tuple[tuple[int, ...], bool, np.dtype[Any]]:
+    """Shape, order and type of the array of an open file."""
     file.seek(0)
-    version = np.lib.format.read_magic(file)
-    readers = {(1, 0): np.lib.format.read_array_header_1_0, (2, 0): np.lib.format.read_array_header_2_0}
-    if version not in readers:
-        raise ValueError(f"format version {version}")
-    shape, _, kind = readers[version](file)
-    return shape, kind
+    first = np.lib.format.read_magic(file) == (1, 0)  # of the versions; 3.0 is as 2.0, but for names of columns
+    return np.lib.format.read_array_header_1_0(file) if first else np.lib.format.read_array_header_2_0(file)
 
 
 # Point clouds

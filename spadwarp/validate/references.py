@@ -12,8 +12,7 @@ _VALUES = read_toml(Path(__file__).with_name("references.toml"))
 
 
 class Slab(NamedTuple):
-    """An index-matched slab, normal incidence: fractions that leave it, `transmitted` with the direct beam, or their
-    derivatives."""
+    """Index-matched, normal incidence: fractions that leave it, `transmitted` with the direct beam; or derivatives."""
 
     anisotropy: float
     albedo: float

@@ -131,8 +131,7 @@ def _endings() -> defaultdict[str, set[str]]:
     for device in wp.get_cuda_devices():
         with contextlib.suppress(RuntimeError):  # of a GPU that this Warp cannot compile for
             kind, arch = device.get_cuda_output_format(), device.get_cuda_compile_arch()
-            made = [PTX] if kind == "ptx" else [other for other in CUBIN if other // 10 == arch // 10 and other <= arch]
-            for other in made:
+            for other in [PTX] if kind == "ptx" else [one for one in CUBIN if one // 10 == arch // 10 and one <= arch]:
                 endings[f"sm{other}.{kind}"].add(f"sm{arch}.{kind}")
     return endings
 
