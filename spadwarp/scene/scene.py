@@ -163,7 +163,7 @@ class Scene(Shown, Document):
         """Why light cannot pass the ports, or cannot be computed through them."""
         camera, laser = self.camera.port, self.laser.port
         if laser == "camera" and camera is None:
-            yield "laser.port = 'camera' needs a camera.port"
+            yield "laser.port = 'camera' needs a camera.port, such as camera.port.preset = 'flat-glass'"
         for section, port in (("camera", camera), ("laser", laser)):
             try:
                 _ = isinstance(port, Port) and port.indices(self.laser.wavelength_nm)

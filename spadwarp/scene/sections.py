@@ -674,6 +674,8 @@ def _insert(model: type[BaseModel], layer: dict[Any, Any], key: Key, value: Any)
     whole, is_known, is_list = f"override {shown(key_text(key))}", True, False
     unfit = ConfigError(f"{whole} does not name a field; write section.field or targets[0].field")
     table: type[BaseModel] | None = model
+    if len(key) > 1 and key[-1] == "preset" and value == "none":  # no port, no sea
+        key, value = key[:-1], None
     for part in key:
         if is_known and isinstance(part, int) == (table is not None and not is_list):
             raise unfit

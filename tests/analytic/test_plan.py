@@ -47,7 +47,8 @@ def test_terms_add_up_and_go_into_json(found):
     terms = found.terms
     bound = math.hypot(terms["shot noise"], terms["background"])
     assert terms["Cramér–Rao bound"] == pytest.approx(bound)
-    assert terms["total"] == pytest.approx(math.hypot(bound, terms["forward scattering"], terms["pile-up"]))
+    squares = bound, terms["estimator"], terms["forward scattering"], terms["pile-up"]
+    assert terms["total"] == pytest.approx(math.hypot(*squares))
     assert found.frame_time == found.pulses / 1e5
     fields = found.to_dict()
     assert fields["values"]["gate.bins"] == found.scene.gate.bins and "scene" not in fields
@@ -72,6 +73,24 @@ def test_few_photons_leave_the_pulses_of_many_within_their_range():
     assert many.judged and many.pulses_range[1] < 1.5 * many.pulses_range[0]
     for one in few:
         assert one.pulses_range[0] <= many.pulses_range[1] and many.pulses_range[0] <= one.pulses_range[1]
+
+
+@pytest.mark.physics
+def test_an_estimator_reaches_the_depth_error_with_the_pulses_that_are_proposed_for_it(found):
+    """Photons of their own, all pixels. The bound alone promises `peak` too much."""
+    assert found.terms["estimator"] == 0.0
+    planned = proposal(method="peak")
+    terms, bound = planned.terms, planned.pilot.bound
+    assert planned.reached and terms["estimator"] > 0.5 * terms["Cramér–Rao bound"]
+    result = spadwarp.simulate(planned.scene, photons=1_000_000, seed=99, device="cpu")
+    few = math.ceil((bound / math.sqrt(0.01**2 - terms["forward scattering"] ** 2)) ** 2)
+    error = {}
+    for pulses in (few, planned.pulses):
+        frames = spadwarp.detect(result, pulses=pulses, frames=4, seed=1, device="cpu")
+        time = frames.arrival_time("peak", min_significance=0.0, device="cpu")
+        depth = spadwarp.scene.sight.depth_from_time(time, scene=planned.scene)
+        error[pulses] = float(np.nanmedian(np.abs(depth - result.truth.depth)))
+    assert 0.004 < error[planned.pulses] < 0.01 < error[few]
 
 
 @pytest.mark.physics
@@ -140,7 +159,10 @@ def test_pulse_energy_keeps_the_limits():
     safe = proposal(make(laser={"pulse_energy": 1e-3, "wavelength_nm": 450.0}), eye_distance=0.005)
     assert safe.energy_limit == "eye"
     assert eye_limit(safe.scene.laser, distance=0.1).hazard_distance <= 0.005
-    assert proposal(full_power=True).scene.laser.pulse_energy > 1e-9
+    full = proposal(full_power=True)
+    assert full.scene.laser.pulse_energy > 1e-9
+    own, proposed = (eye_limit(scene).hazard_distance for scene in (make(), full.scene))
+    assert full.eye.hazard_distance == proposed > own
 
 
 @pytest.mark.slow
