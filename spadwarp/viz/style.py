@@ -205,7 +205,7 @@ def wrapped(text: str, width: float, *, size: float = 8.0) -> str:
 def wrapped_items(text: str, width: float) -> str:
     """The same for items between commas and semicolons, which stay whole."""
     items = re.split("(?<=[,;]) ", text)
-    return wrapped(" ".join(item.replace(" ", "\N{NO-BREAK SPACE}") for item in items), width)
+    return wrapped(" ".join(item.replace(" ", "\N{NO-BREAK SPACE}") for item in items), width).replace(";\n", "\n")
 
 
 def power_text(value: float) -> str:
@@ -324,6 +324,10 @@ def hatch(axis: Axes, pixels: NDArray[np.bool_]) -> None:
         marks.set(edgecolor="0.35", linewidth=0.0)
 
 
+MOST_HATCHED = 0.9
+"""Part of the pixels from which on hatching would hide the image, and words alone say what they are."""
+
+
 class Panels:
     """A figure of `count` images of `shape` (height, width), as many in a line as fit, each with its colour bar below.
 
@@ -379,7 +383,7 @@ class Panels:
             short = axis.yaxis if height < width else axis.xaxis
             short.set_major_locator(MaxNLocator(nbins=1, integer=True, min_n_ticks=1))
         shown = axis.imshow(image, cmap=colour_map(colours), norm=scale, clim=limits)
-        if self.unclear is not None and np.isfinite(image).any():
+        if self.unclear is not None and np.isfinite(image).any() and self.unclear.mean() < MOST_HATCHED:
             hatch(axis, self.unclear)
         extend = ("neither", "min", "max", "both")[int((image < low).any()) + 2 * int((image > high).any())]
         label = wrapped(label, self._line)

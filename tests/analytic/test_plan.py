@@ -115,7 +115,7 @@ def test_clear_water_leaves_no_floor_and_its_bound_is_that_of_a_gaussian():
     clear = make(medium={"extinction": 0.1, "albedo": 0.0}, detector={"dark_count_rate": 0.0})
     clear = proposal(clear.with_overrides({"targets[0].rotation_deg": [0.0, 0.0, 0.0]}))
     bin_range = range_from_time(50e-12, 1.36)  # within a bin the run does not know where the light is
-    assert clear.pilot.floor == clear.pilot.unscattered_floor
+    assert all(floor <= clear.pilot.unscattered_floor[name] for name, floor in clear.pilot.floor.items())
     assert clear.pilot.floor["likelihood"] < 0.5 * bin_range and clear.limit in ("jitter", "shot noise")
     assert clear.pilot.backscatter == 0 and clear.terms["background"] < 0.2 * clear.terms["shot noise"]
     # Light is spread evenly over a bin of the run, one of the detector, and one to which pixels are aligned.
@@ -159,10 +159,13 @@ def test_pulse_energy_keeps_the_limits():
     safe = proposal(make(laser={"pulse_energy": 1e-3, "wavelength_nm": 450.0}), eye_distance=0.005)
     assert safe.energy_limit == "eye"
     assert eye_limit(safe.scene.laser, distance=0.1).hazard_distance <= 0.005
-    full = proposal(full_power=True)
-    assert full.scene.laser.pulse_energy > 1e-9
-    own, proposed = (eye_limit(scene).hazard_distance for scene in (make(), full.scene))
-    assert full.eye.hazard_distance == proposed > own
+
+
+def test_the_hazard_distance_is_that_of_the_proposed_pulse_energy():
+    weak = make(laser={"pulse_energy": 1e-12, "repetition_rate": 1e7})
+    full = proposal(weak, full_power=True, photons=20_000)
+    own, proposed = (eye_limit(scene).hazard_distance for scene in (weak, full.scene))
+    assert full.scene.laser.pulse_energy > 1e-9 and full.eye.hazard_distance == proposed > own
 
 
 @pytest.mark.slow
@@ -345,9 +348,9 @@ def test_a_range_that_is_not_judged_counts_neither_as_reached_nor_as_not(start, 
 def test_the_page_shows_verdicts_as_they_are_printed():
     page = (ROOT / "docs" / "planning.md").read_text(encoding="utf-8")
     found, terms = plan(20_000), dict.fromkeys(("shot noise", "total"), 0.0)
-    reached = {"reached": True, "pulses_for": "depth error", "pulses_range": (450, 470), "terms": terms}
+    reached = {"reached": True, "pulses_for": "depth error", "pulses_range": (260, 500), "terms": terms}
     said = [
-        {"pulses": 460, "frame_time": 46e-6, "limit": "shot noise", "terms": terms | {"total": 0.0099}},
+        {"pulses": 340, "frame_time": 17.2e-6, "limit": "forward scattering", "terms": terms | {"total": 0.00998}},
         {
             "pulses": 18_000,
             "pulses_range": (15_000, 22_000),
@@ -355,7 +358,14 @@ def test_the_page_shows_verdicts_as_they_are_printed():
             "limit": "backscatter",
             "reached": False,
         },
-        {"pulses": 900, "pulses_for": "floor", "frame_time": 45e-6, "limit": "bin width", "reached": False}
+        {
+            "pulses": 900,
+            "pulses_range": (890, 910),
+            "pulses_for": "floor",
+            "frame_time": 45e-6,
+            "limit": "bin width",
+            "reached": False,
+        }
         | {"terms": terms | {"total": 0.161}},
         {"pulses_for": "not judged", "pilot": dataclasses.replace(found.pilot, photons=3_200_000)}
         | {"photons_needed": 5.1e7, "seconds_needed": 340.0},
