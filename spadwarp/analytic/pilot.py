@@ -205,32 +205,21 @@ def measure(
     bound, shot, information_noise = _bounds(both, (first, second), pool, device)
     excess: Any = ()
     if method != "likelihood" and bound < math.inf:
-        seen_light = returned + constant
-        if scene.detector.mode == "first_photon":
-            seen_light = first_photon_probabilities(seen_light[None, None], device=device)[0, 0]
         first_pulses = max((bound / depth_error) ** 2, 1.0)
-        excess = _excess(frames, seen_light, constant, method, bound / pool.slope, first_pulses, device)
+        excess = _excess(frames, returned + constant, constant, method, bound / pool.slope, first_pulses, device)
     lights = [run.tallies[:2].sum(axis=(0, 3), dtype=np.float64)[seen] for run in (first, second)]
     return Pilot(
-        pixels=int(seen.sum()),
-        unscattered=float(both.component("ballistic")[typical].sum(axis=-1).mean() * scale),
-        target=float(returned.sum()),
-        backscatter=float(_background(both)[typical].sum(axis=-1).mean() * scale),
+        pixels=int(seen.sum()), unscattered=float(both.component("ballistic")[typical].sum(axis=-1).mean() * scale),
+        target=float(returned.sum()), backscatter=float(_background(both)[typical].sum(axis=-1).mean() * scale),
         noise=float(np.median(noise_rate(both.scene, both.truth))) * (scene.gate.stop - scene.gate.start),
-        brightest=_brightest(*(run.detections.sum(axis=-1, dtype=np.float64) for run in (first, second))),
-        bound=bound,
-        shot_noise=shot,
-        information_noise=information_noise,
-        floor={name: abs(bias[name]) if even else median(np.abs(values)) for name, values in error.items()},
-        bias=bias,
-        unscattered_floor={name: median(np.abs(values)) for name, values in unscattered.items()},
-        pile_up=piled,
-        peak=float(peak),
-        level=float(level),
+        brightest=_brightest(*(run.detections.sum(axis=-1, dtype=np.float64) for run in (first, second))), bound=bound,
+        shot_noise=shot, information_noise=information_noise,
+        floor={name: abs(bias[name]) if even else median(np.abs(values)) for name, values in error.items()}, bias=bias,
+        unscattered_floor={name: median(np.abs(values)) for name, values in unscattered.items()}, pile_up=piled,
+        peak=float(peak), level=float(level),
         light_noise=math.sqrt(np.mean(np.square(lights[0] - lights[1]))) / max(float(np.mean(sum(lights))), 1e-300),
-        photons=both.photons,
-        excess=excess,
-    )
+        photons=both.photons, excess=excess,
+    )  # fmt: skip
 
 
 def _time(frames: Frames, histogram: Any, background: Any, method: Method, device: str | None) -> Floats:
@@ -245,14 +234,15 @@ def _excess(
     """See `Pilot`: arrival times of counts that are drawn from `light` [T] against that of `light` itself; `bound` for
     one pulse [s]. The largest tenth of the errors, false peaks, are left out."""
     drawn, random, found = int(np.clip(_MOST_DRAWN // len(light), 16, 512)), np.random.default_rng(0), []
+    if frames.detector.mode == "first_photon":
+        light = first_photon_probabilities(light[None, None], device=device)[0, 0]
     for pulses in first * 4.0 ** np.arange(_OCTAVES):
-        expected = np.broadcast_to(pulses * light, (drawn, len(light)))
-        times = _time(
-            frames, np.concatenate([expected[:1], random.poisson(expected)]), pulses * background, method, device
-        )
+        expected = np.tile(pulses * light, (drawn, 1))
+        counts = np.concatenate([expected[:1], random.poisson(expected)])
+        times = _time(frames, counts, pulses * background, method, device)
         off = np.sort(np.nan_to_num(np.abs(times[1:] - times[0]), nan=math.inf))[: round(0.9 * drawn)]
-        noise = float(off.mean()) / _MEAN_OF_90 * math.sqrt(pulses)
-        found.append((float(pulses), min(max(noise / bound, 1.0), 1e6)))
+        excess = float(off.mean()) / _MEAN_OF_90 * math.sqrt(pulses) / bound
+        found.append((float(pulses), min(max(excess, 1.0), 1e6)))
     return tuple(found)
 
 

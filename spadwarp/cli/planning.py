@@ -117,22 +117,10 @@ def plan(
     for text in _warnings(read, but="targets" if range_ else ""):
         complain(text)
     found = spadwarp.plan(
-        read,
-        depth_error=depth_error,
-        time=time,
-        ranges=range_,
-        margin=margin,
-        method=method,
-        full_power=full_power,
-        eye_distance=eye_distance,
-        eye_exposure=eye_exposure,
-        photons="auto" if photons is None else photons,
-        seed=seed,
-        largest_range=not no_range,
-        channel=channel,
-        device=device,
-        progress=progress(),
-    )
+        read, depth_error=depth_error, time=time, ranges=range_, margin=margin, method=method, full_power=full_power,
+        eye_distance=eye_distance, eye_exposure=eye_exposure, photons="auto" if photons is None else photons,
+        seed=seed, largest_range=not no_range, channel=channel, device=device, progress=progress(),
+    )  # fmt: skip
     files = [] if write is None else [write]
     for file in files:
         made = f"# Proposed by `spadwarp plan {scene.name} --depth-error {depth_error:g}`: {_verdict(found)}\n\n"
@@ -265,6 +253,7 @@ def sweep(
     draw: Any
     if of_range:
         values = spadwarp.analytic.parse_vary(texts[0])[1] if vary else None
+        opt.warn_of(read)
         lines = found = spadwarp.budget(read, values, medium or None, reflectance=reflectance, device=device)
         keys, draw = [{"water": row.medium} for row in found], spadwarp.viz.draw_budget
     else:

@@ -159,9 +159,8 @@ def noise_problem(result: Result) -> str:
     if ratio <= NOISE_GOAL:
         return ""
     if ratio == math.inf:
-        if (
-            seen := float(np.median(result.detections.sum(axis=2)))
-        ) > 0.0 and result.scene.detector.mode == "first_photon":
+        seen = float(np.median(result.detections.sum(axis=2))) if result.scene.detector.mode == "first_photon" else 0.0
+        if seen > 0.0:
             text = "the first of them alone is recorded, and the target's are lost: less laser.pulse_energy"
             return f"pile-up: {seen:.2g} photons of a pulse would be detected in the median pixel; {text}"
         return f"not enough photons: none of {result.photons:.3g} brought light back"
@@ -176,8 +175,10 @@ def noise_problem(result: Result) -> str:
 
 def noise_caption(ratio: float | None) -> str:
     """For the caption of a picture of frames that show the noise of the simulation; else empty."""
-    if ratio is None or ratio <= NOISE_GOAL or ratio == math.inf:
-        return "" if ratio != math.inf else "; no light of the target is left"
+    if ratio is None or ratio <= NOISE_GOAL:
+        return ""
+    if ratio == math.inf:
+        return "; no light of the target is left"
     times = f"{ratio:.2g}" if ratio < 100.0 else count(float(f"{ratio:.2g}"))
     return f"; too few photons traced: noise of the simulation is {times} times the variance of the photons"
 

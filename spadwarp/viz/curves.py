@@ -87,10 +87,8 @@ def draw_sweep(curves: Sweep, path: str | Path | None = None, *, width: float = 
             hollow = np.where(moved[own], shown, np.nan)
             axis.plot(place, hollow, "o", color=style_of["color"], markerfacecolor="white", markevery=every, zorder=3)
             for mark, cases in (("x", np.isinf(y[own])), ("$?$", unjudged[own])):
-                some, top = place[cases][::every], axis.get_xaxis_transform()
-                axis.scatter(
-                    some, np.full(len(some), 0.97 - 0.06 * number), 25.0, style_of["color"], marker=mark, transform=top
-                )
+                some, top, high = place[cases][::every], axis.get_xaxis_transform(), 0.97 - 0.06 * number
+                axis.scatter(some, np.full(len(some), high), 25.0, style_of["color"], marker=mark, transform=top)
         if name == "sigma_depth" and curves.fields == ("range", "water"):
             asked = f"depth error of {100 * TOLERANCE:g} cm"
             axis.axhline(TOLERANCE * 1e3, color="0.4", linewidth=0.8, linestyle=":", label=asked)

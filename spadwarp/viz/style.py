@@ -313,19 +313,18 @@ def mark_pixels(axis: Axes, missed: NDArray[np.bool_], invented: NDArray[np.bool
     axis.imshow(marks)
 
 
+MOST_HATCHED = 0.9  # part of the pixels from which on hatching would hide the image: words alone say what they are
+
+
 def hatch(axis: Axes, pixels: NDArray[np.bool_]) -> None:
     """Veils and hatches pixels that mean nothing."""
-    if pixels.any():
+    if 0.0 < pixels.mean() < MOST_HATCHED:
         padded = np.pad(pixels, 1).repeat(2, axis=0).repeat(2, axis=1)[1:-1, 1:-1].astype(np.float64)
         height, width = pixels.shape  # corners of the pixels, so that one alone is a square
         x, y = (np.repeat(np.arange(n + 1) - 0.5, 2) + np.tile([-1e-3, 1e-3], n + 1) for n in (width, height))
         axis.autoscale(False)
         marks = axis.contourf(x, y, padded, levels=[0.5, 1.5], colors=[(1.0, 1.0, 1.0, 0.55)], hatches=["//////"])
         marks.set(edgecolor="0.35", linewidth=0.0)
-
-
-MOST_HATCHED = 0.9
-"""Part of the pixels from which on hatching would hide the image, and words alone say what they are."""
 
 
 class Panels:
@@ -383,7 +382,7 @@ class Panels:
             short = axis.yaxis if height < width else axis.xaxis
             short.set_major_locator(MaxNLocator(nbins=1, integer=True, min_n_ticks=1))
         shown = axis.imshow(image, cmap=colour_map(colours), norm=scale, clim=limits)
-        if self.unclear is not None and np.isfinite(image).any() and self.unclear.mean() < MOST_HATCHED:
+        if self.unclear is not None and np.isfinite(image).any():
             hatch(axis, self.unclear)
         extend = ("neither", "min", "max", "both")[int((image < low).any()) + 2 * int((image > high).any())]
         label = wrapped(label, self._line)
