@@ -144,9 +144,10 @@ def axis_rows(
             depths = np.array([scene.optical_depth(start_point, line.points([x])[0].tolist()) for x in inside])
         for i, (distance, depth) in enumerate(zip(inside, depths, strict=True)):
             row = BudgetRow(
-                medium=name or scene.medium.preset or "scene", extinction=scene.medium.extinction, range=float(distance),
-                optical_depth=float(depth), gate_start=start, gate_stop=stop, gate_moved=(start, stop) != gate,
-                pulses=pulses, background=float(background[i]), pulses_for_1cm=float(needed[i]),
+                medium=name or scene.medium.preset or "scene", extinction=scene.medium.extinction,
+                range=float(distance), optical_depth=float(depth), gate_start=start, gate_stop=stop,
+                gate_moved=(start, stop) != gate, pulses=pulses, background=float(background[i]),
+                pulses_for_1cm=float(needed[i]),
                 **{field: float(maps[field][i]) for field in _FROM_MAPS},
             )  # fmt: skip
             rows.append(row)
