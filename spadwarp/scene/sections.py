@@ -673,8 +673,7 @@ def _insert(model: type[BaseModel], layer: dict[Any, Any], key: Key, value: Any)
     whole, is_known, is_list = f"override {shown(key_text(key))}", True, False
     unfit = ConfigError(f"{whole} does not name a field; write section.field or targets[0].field")
     table: type[BaseModel] | None = model
-    if len(key) > 1 and key[-1] == "preset" and value == "none":  # no port, no sea
-        key, value = key[:-1], None
+    key, value = (key[:-1], None) if key[1:] and (key[-1], value) == ("preset", "none") else (key, value)  # no port
     for part in key:
         if is_known and isinstance(part, int) == (table is not None and not is_list):
             raise unfit
@@ -802,9 +801,8 @@ def _line(key: Key, info: FieldInfo | None, problem: Any, model: type[BaseModel]
         return f"{entry} is not one of {listed}{suggestion(value, choices)}"
     if kind in _KINDS:
         values = f" of {size} values" if kind == "tuple_type" and size is not None else ""
+        values = f" in {interval_of(info)}" if kind.startswith("int_") and info is not None else values
         words = f" not {_KINDS[kind]}{values}"
-        if kind.startswith("int_") and info is not None and not choices:
-            words += f" in {interval_of(info)}"
         if choices:
             words = f" neither {' nor '.join([_KINDS[kind], *map(repr, choices)])}"
         return f"{entry} is{words}{_instead(key, info, kind, value)}"
