@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from spadwarp.denoise.frames import DepthFrames, fill_missing
-from spadwarp.denoise.histograms import histogram_tensors
+from spadwarp.denoise.histograms import count_frames
 from spadwarp.denoise.network_files import require_torch
 from spadwarp.values import ArgumentError, SpadwarpError, check_real
 
@@ -141,7 +141,7 @@ def classical_depth(
 
     found = []
     with torch.inference_mode():
-        for cube, level, tap in histogram_tensors(counts, background, response, device):
+        for cube, level, tap in count_frames(counts, background, response).tensors(device):
             score = log_likelihood(cube, level, tap)
             if method == "pooled":
                 score = pooled(score, int(tuning or 7))

@@ -13,15 +13,8 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from spadwarp.denoise.baselines import BASELINES, CLASSICAL, MEDIAN_WINDOWS, classical_depth, median_filter
-from spadwarp.denoise.frames import (
-    MARGIN,
-    DepthFrames,
-    checked_gate,
-    depth_frames,
-    depth_values,
-    narrowed_input,
-)
-from spadwarp.denoise.histograms import histogram_tensors, merged_bins, target_bins, without_defects
+from spadwarp.denoise.frames import DepthFrames, checked_gate, depth_frames, depth_values, narrowed_input
+from spadwarp.denoise.histograms import CountFrames, merged_bins, target_bins, without_defects
 from spadwarp.denoise.network_files import MODELS, Precision, fast_precision, load_network, require_torch, torch_device
 from spadwarp.frames.backgrounds import BackgroundLaw, profile_of_depth
 from spadwarp.frames.depth import arrival_time
@@ -41,6 +34,9 @@ _LARGEST = 3.0  # correction of a logit
 
 METHODS = (*MODELS, *(name for name in BASELINES if name != "input"), *CLASSICAL)
 """Models of `apply`."""
+
+FROM_COUNTS = ("histograms", *CLASSICAL)
+"""Those that use counts."""
 
 _ROWS = 64  # whose counts are summed at once: little memory
 _PIXELS_AT_ONCE = {"cpu": 1 << 16, "cuda": 1 << 23}  # a batch that fits into a CPU's cache is faster
@@ -140,53 +136,37 @@ def estimate(
     gate, depth = checked_gate(gate), depth_values(depth)
     if precision is not None:
         check_choice("precision", precision, get_args(Precision))
-    if model not in ("histograms", *CLASSICAL):
-        if profile is None and model in ("pyramid", "gating"):
-            profile = profile_of_depth(depth, gate)
-        frames = depth_frames(depth, gate=gate, profile=profile)
-        found = estimate_frames(
-            frames, model=model, weights=weights, device=device, precision=precision, progress=progress
-        )
+    if model not in FROM_COUNTS:
+        options: dict[str, Any] = {"weights": weights, "device": device, "precision": precision, "progress": progress}
+        found = estimate_depth(depth, gate=gate, model=model, profile=profile, **options)
     else:
         if counts is None or response is None:
             raise ArgumentError(f"model = {model!r} needs counts and response, of which some are missing")
-        cubes, levels, taps, defects, _ = without_defects(counts, background, response)
-        if depth.shape != cubes.shape[:-1]:
-            raise ArgumentError(f"depth has shape {depth.shape}; {cubes.shape[:-1]} is needed, that of counts")
+        frames = without_defects(counts, background, response)
+        if depth.shape != frames.counts.shape[:-1]:
+            raise ArgumentError(f"depth has shape {depth.shape}; {frames.counts.shape[:-1]} is needed, that of counts")
         if model in CLASSICAL and weights is not None:
             raise ArgumentError(f"weights are for a network, not for {model!r}")
-        if defects is not None:
-            warnings.warn(defects.summary, SpadwarpWarning, stacklevel=2)
-            depth = np.where(defects.hide(depth, gate, taps.size), np.float32(np.nan), depth)
-        first, stop, part = target_bins(cubes, levels, taps, gate)
-        if model not in CLASSICAL and _leaves_frames_empty(depth, gate, part):
-            first, stop, part = 0, cubes.shape[-1], gate
+        if frames.defects is not None:
+            warnings.warn(frames.defects.summary, SpadwarpWarning, stacklevel=2)
+            hidden = frames.defects.hide(depth, gate, frames.response.size)
+            depth = np.where(hidden, np.float32(np.nan), depth)
+        bins, width = target_bins(frames), (gate[1] - gate[0]) / frames.counts.shape[-1]
+        start, stop = gate[0] + bins.start * width, gate[0] + bins.stop * width
 
         def to_depth(place: NDArray[np.float32]) -> NDArray[np.float32]:
-            return part[0] + (part[1] - part[0]) * place
+            return start + (stop - start) * place
 
-        found = estimate_histograms(
-            depth, cubes, levels, taps, bins=slice(first, stop), gate=part, model=model, to_depth=to_depth,
-            weights=weights, device=device,
-        )  # fmt: skip
-        given: dict[str, Any] = {"min_significance": min_significance, "level_known": not isinstance(background, str)}
-        found = detected(found, cubes, levels, taps, model=model, **given)
+        options = {"bins": bins, "bin_width": width, "to_depth": to_depth, "weights": weights, "device": device}
+        found = estimate_histograms(depth, frames, model=model, **options)
+        found = detected(found, frames, model=model, min_significance=min_significance)
     shaped: Any = (None if values is None else values.reshape(np.shape(depth)) for values in found)
     return Estimate(*shaped)
 
 
-def detected(
-    found: Estimate,
-    counts: NDArray[Any],
-    background: NDArray[Any],
-    response: NDArray[Any],
-    *,
-    model: str,
-    min_significance: float,
-    level_known: bool = True,
-) -> Estimate:
+def detected(found: Estimate, given: CountFrames, *, model: str, min_significance: float) -> Estimate:
     """`found` with the significance of the counts, and neither depth nor target below the least; of rates as it is."""
-    least = check_real("min_significance", min_significance, "[0, 1000]")
+    least, counts = check_real("min_significance", min_significance, "[0, 1000]"), given.counts
     if counts.dtype.kind not in "biu" and not np.array_equal(counts, np.rint(counts)):
         return found
     side = 1 if model == "likelihood" else 7
@@ -202,20 +182,20 @@ def detected(
         return cube
 
     frames = counts.reshape(-1, *counts.shape[-3:])
-    known, height = np.asarray(background, np.float64), frames.shape[1]
+    known, height = np.asarray(given.background, np.float64), frames.shape[1]
     significance = np.empty(frames.shape[:-1], np.float32)
-    options: dict[str, Any] = {"level_known": level_known, "device": "cpu"}
-    half = np.flatnonzero(response >= 0.5 * np.max(response))
+    options: dict[str, Any] = {"level_known": given.level_known, "device": "cpu"}
+    half = np.flatnonzero(given.response >= 0.5 * np.max(given.response))
     width = (half[-1] - half[0] + 1) * (1.0 - 1e-9)  # bins, and not one more by rounding
     options["irf"] = InstrumentResponse(sigma=width * 1e-12 / FWHM_PER_SIGMA)
     for top in range(0, height, _ROWS):
         first, stop = max(0, top - side // 2), top + _ROWS + side // 2
         inner = slice(top - first, top - first + _ROWS)
         if known.ndim == 1:
-            pixels = summed(np.ones((*frames[0, first:stop].shape[:2], 1)))[inner]
-            options["background"] = np.maximum(pixels * known, 0.0)
+            level = known * summed(np.ones((*frames[0, first:stop].shape[:2], 1)))
         else:
-            options["background"] = np.maximum(summed(known[first:stop])[inner], 0.0)
+            level = summed(known[first:stop])
+        options["background"] = np.maximum(level[inner], 0.0)
         for cube, image in zip(frames, significance, strict=True):
             some, out = summed(cube[first:stop].astype(np.int64))[inner], image[top : top + _ROWS]
             arrival_time(some, gate_start=0.0, bin_width=1e-12, significance=out, **options)
@@ -230,31 +210,31 @@ _COARSE = 0.76  # part of the light in one bin, from which on the FWHM of a Gaus
 
 def estimate_histograms(
     depth: NDArray[Any],
-    counts: NDArray[Any],
-    background: NDArray[np.float32],
-    response: NDArray[Any],
+    frames: CountFrames,
     *,
     bins: slice,
-    gate: tuple[float, float],
+    bin_width: float,
     model: str,
     to_depth: Callable[[NDArray[np.float32]], NDArray[Any]],
     weights: str | Path | None,
     device: str | None,
 ) -> Estimate:
-    """`estimate` for the methods that use counts, in the bins that hold the target; `gate` is theirs."""
-    given: dict[str, Any] = {"background": background[..., bins], "response": response, "device": device}
+    """`estimate` for the methods that use counts, in the bins that hold the target; `bin_width` is in depth [m]."""
+    frames = frames.part(bins)
     if model in CLASSICAL:
-        place = classical_depth(counts[..., bins], method=model, **given)  # type: ignore[arg-type]
+        counts, background, response = frames[:3]
+        given: dict[str, Any] = {"background": background, "response": response, "device": device}
+        place = classical_depth(counts, method=model, **given)  # type: ignore[arg-type]
         found = np.stack([place, np.ones_like(place), np.full_like(place, np.nan)])
     else:
-        found = _by_network(counts[..., bins], weights=weights, **given)
+        found = _by_network(frames, weights, device)
         empty = ~((depth > 0) & np.isfinite(depth)).reshape(found.shape[1:]).any(axis=(1, 2))
         found[0, empty], found[1, empty] = np.nan, 0.0
     found[0] = to_depth(found[0])
     found = found.reshape(3, *depth.shape)
+    response = frames.response
     if np.max(response) >= _COARSE * np.sum(response):  # histograms tell no place within a bin; the pixel's light does
-        near = np.abs(depth - found[0]) < (gate[1] - gate[0]) / (bins.stop - bins.start)
-        found[0] = np.where(near, depth, found[0])
+        found[0] = np.where(np.abs(depth - found[0]) < bin_width, depth, found[0])
     return Estimate(*found)
 
 
@@ -271,26 +251,23 @@ def _parts(length: int, most: int) -> list[tuple[slice, slice]]:
     return [(slice(one, one + step), slice(max(0, one - _MARGIN), one + step + _MARGIN)) for one in firsts]
 
 
-def _by_network(
-    counts: NDArray[Any], *, background: NDArray[Any], response: NDArray[Any], weights: Any, device: str | None
-) -> NDArray[np.float32]:
+def _by_network(given: CountFrames, weights: str | Path | None, device: str | None) -> NDArray[np.float32]:
     """Depth over the gate, target probability and confidence, `[3, N, H, W]`."""
     torch = require_torch()
     from spadwarp.denoise.histogram_network import answer, rebinned
 
-    frames = counts.reshape(-1, *counts.shape[-3:])
+    frames, level = given.counts.reshape(-1, *given.counts.shape[-3:]), given.background
     height, width, bins = frames.shape[1:]
     found = np.empty((3, *frames.shape[:3]), np.float32)
-    network, merged = load_network("histograms", weights, str(torch_device(device))), merged_bins(bins, response)
+    network, merged = load_network("histograms", weights, str(torch_device(device))), merged_bins(bins, given.response)
     most = max(_LEAST_PART, math.isqrt(_AT_ONCE * merged // bins) - 2 * _MARGIN)
     with torch.inference_mode():
         for (rows, seen_rows), (columns, seen_columns) in product(_parts(height, most), _parts(width, most)):
-            part = np.s_[..., seen_rows, seen_columns, :]
-            level = background[part] if background.ndim == 3 else background
-            given = histogram_tensors(frames[part], level, response, device)
+            seen = np.s_[..., seen_rows, seen_columns, :]
+            part = given._replace(counts=frames[seen], background=level[seen] if level.ndim == 3 else level)
             sides = (rows, seen_rows), (columns, seen_columns)
-            inner = tuple(slice(one.start - seen.start, one.stop - seen.start) for one, seen in sides)
-            for image, (cube, known, taps) in zip(found.swapaxes(0, 1), given, strict=True):
+            inner = tuple(slice(one.start - around.start, one.stop - around.start) for one, around in sides)
+            for image, (cube, known, taps) in zip(found.swapaxes(0, 1), part.tensors(device), strict=True):
                 if merged > 1:
                     cube, known, taps = rebinned(cube, known, taps, merged)
                 probability, target = network(cube, known, taps)
@@ -302,18 +279,6 @@ def _by_network(
     return found
 
 
-def _leaves_frames_empty(depth: NDArray[Any], gate: tuple[float, float], part: tuple[float, float]) -> bool:
-    """Whether a frame has reports near the gate, but none near this part of it."""
-
-    def reports(start: float, stop: float) -> NDArray[np.bool_]:
-        margin = MARGIN * (stop - start)
-        with np.errstate(invalid="ignore"):
-            near = (depth > 0) & (depth >= start - margin) & (depth <= stop + margin)
-        return np.asarray(near.any(axis=(-2, -1)))
-
-    return bool((reports(*gate) & ~reports(*part)).any())
-
-
 def target_threshold(model: str) -> float:
     """The probability from which on a pixel counts as one that sees a target, by the name of the method."""
     # With 0.08 PyramidNet misses 0.6 % of the target in drawn scenes in open water that no training saw, 2.7 % with the
@@ -321,10 +286,13 @@ def target_threshold(model: str) -> float:
     return 0.08 if model == "pyramid" else 0.5
 
 
-def denoise_frames(frames: DepthFrames, *, model: str, **options: Any) -> tuple[NDArray[np.float32], NDArray[np.bool_]]:
-    """Depth of every pixel [m], and where a target is seen (`target_threshold`): float32 and bool `[N, H, W]`."""
-    found = estimate_frames(frames, model=model, **options)
-    return found.depth, found.target_probability >= target_threshold(model)
+def estimate_depth(
+    depth: NDArray[np.float32], *, gate: tuple[float, float], model: str, profile: ArrayLike | None, **options: Any
+) -> Estimate:
+    """`estimate` for the methods that use depth alone; `options`: of `estimate_frames`."""
+    if profile is None and model in ("pyramid", "gating"):
+        profile = profile_of_depth(depth, gate)
+    return estimate_frames(depth_frames(depth, gate=gate, profile=profile), model=model, **options)
 
 
 def estimate_frames(
@@ -346,7 +314,7 @@ def estimate_frames(
         check_choice("model", model, METHODS)
     if precision is not None:
         check_choice("precision", precision, get_args(Precision))
-    if model in ("histograms", *CLASSICAL):
+    if model in FROM_COUNTS:
         raise ArgumentError(f"model = {model!r} needs counts with their background and response; they are missing")
     if model in BASELINES:
         return _baseline(frames, model, window, weights)
@@ -356,7 +324,7 @@ def estimate_frames(
         precision = "float32"
     kind = precision or fast_precision(str(place))
     network = load_network(model, weights, str(place), kind)
-    inputs = None if model == "pyramid" else frames.network_input()
+    inputs = None if model == "pyramid" else frames.filled()[:, None]
     begin, extent = frames.gate[0], frames.gate[1] - frames.gate[0]
     part = max(1, _PIXELS_AT_ONCE[place.type] // frames.depth[0].size)
     answers, finite = torch.empty(3, *frames.depth.shape), True

@@ -16,9 +16,17 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from spadwarp.denoise.baselines import CLASSICAL, MEDIAN_WINDOWS, TUNINGS, classical_depth
+from spadwarp.denoise.baselines import MEDIAN_WINDOWS, TUNINGS, classical_depth
 from spadwarp.denoise.frames import DepthFrames, depth_frames
-from spadwarp.denoise.inference import METHODS, denoise_frames, estimate, estimate_histograms, target_threshold
+from spadwarp.denoise.histograms import CountFrames
+from spadwarp.denoise.inference import (
+    FROM_COUNTS,
+    METHODS,
+    estimate,
+    estimate_frames,
+    estimate_histograms,
+    target_threshold,
+)
 from spadwarp.denoise.network_files import compared
 from spadwarp.frames.cramer_rao import crlb_from_histogram
 from spadwarp.frames.depth import arrival_time
@@ -148,10 +156,8 @@ def fresh_score(scene: FreshScene, *, weights: str | Path | None = None, device:
             if method == "likelihood":
                 first = depth
     for window in MEDIAN_WINDOWS:
-        judge(
-            f"median {window}",
-            denoise_frames(depth_frames(first, gate=scene.gate), model="median", window=window)[0][0],
-        )
+        filtered = estimate_frames(depth_frames(first, gate=scene.gate), model="median", window=window)
+        judge(f"median {window}", filtered.depth[0])
     shares = []
     for name, background in (("histograms", scene.background), ("histograms, own background", "decay")):
         options = {**given, "background": background, "min_significance": 0.0, "weights": weights}
@@ -246,11 +252,12 @@ def photon_sweep(
             bound[row, column] += float(np.mean(np.minimum(sigma[seen], guess) ** 2)) / frames
             for name, sums in squares.items():  # a median of each window is tried; the others have one variant
                 for total, window in zip(sums, MEDIAN_WINDOWS, strict=False):
-                    if methods[name]["model"] in ("histograms", *CLASSICAL):
-                        found = estimate_histograms(noisy.depth, **histograms, device=device, **methods[name]).depth
+                    options = {"device": device, **methods[name]}
+                    if options["model"] in FROM_COUNTS:
+                        found = estimate_histograms(noisy.depth, **histograms, **options)
                     else:
-                        found, _ = denoise_frames(noisy, window=window, device=device, **methods[name])
-                    total[row, column] += float(np.mean((found[0][seen] - truth[seen]) ** 2)) / frames
+                        found = estimate_frames(noisy, window=window, **options)
+                    total[row, column] += float(np.mean((found.depth[0][seen] - truth[seen]) ** 2)) / frames
             done += 1
             if progress is not None:
                 progress("frames", done, frames * bound.size)
@@ -309,8 +316,8 @@ def photon_frame(
         return depth_from_time(gate.start + part.astype(np.float64) * (gate.stop - gate.start), scene=scene)
 
     histograms = {
-        "counts": counts[None], "background": background[0, 0].astype(np.float32), "response": matrix,
-        "bins": slice(None), "gate": depth_gate, "to_depth": to_depth,
+        "frames": CountFrames(counts[None], background[0, 0].astype(np.float32), matrix.astype(np.float32)),
+        "bins": slice(None), "bin_width": (depth_gate[1] - depth_gate[0]) / gate.bins, "to_depth": to_depth,
     }  # fmt: skip
     return depth_frames(depth, gate=depth_gate, profile=profile), range_from_time(sigma, index), histograms
 
