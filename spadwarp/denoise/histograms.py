@@ -169,7 +169,7 @@ def second_return(
     """
     torch = require_torch()
     from spadwarp.denoise.classical import highest, pooled
-    from spadwarp.denoise.histogram_network import toeplitz
+    from spadwarp.denoise.histogram_network import deviation, toeplitz
 
     first, cubes = real_array("depth", depth), np.asarray(on_host(counts))
     if first.shape != cubes.shape[:-1]:
@@ -181,8 +181,7 @@ def second_return(
         for place, (cube, level, taps) in zip(frames, tensors, strict=True):
             bins = cube.shape[-1]
             at = (torch.from_numpy(np.nan_to_num(place)).to(cube.device)[None] * bins).long().clamp(0, bins - 1)
-            apart = torch.arange(taps.shape[1], device=cube.device) - taps.shape[1] // 2
-            width = float((taps[0] * apart.square()).sum().clamp_min(0.1).sqrt())
+            width = float(deviation(taps, 0.1))
             shape = toeplitz(taps, bins)[0].t()[at]  # of the first return in each pixel
             near = (torch.arange(bins, device=cube.device) - at[..., None]).abs() <= 3.0 * width + 1.0
             signal = ((cube - level) * near).sum(dim=-1, keepdim=True).clamp_min(0.0)

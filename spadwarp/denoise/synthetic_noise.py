@@ -21,7 +21,7 @@ from torch import Tensor
 
 from spadwarp.denoise.classical import highest
 from spadwarp.denoise.frames import LOG_DENSITY_LIMIT, MARGIN
-from spadwarp.denoise.histogram_network import toeplitz
+from spadwarp.denoise.histogram_network import deviation, interpolated, toeplitz
 from spadwarp.denoise.recipe import Noise
 
 _THINGS = 10  # at most, in a scene
@@ -514,10 +514,7 @@ def _backscatter_depth(profile: Tensor, reach: Tensor, u: Tensor) -> Tensor:
     size, bins = profile.shape
     cumulative = torch.cat([profile.new_zeros(size, 1), profile.cumsum(dim=1)], dim=1) / bins
     cumulative = cumulative / cumulative[:, -1:].clamp_min(1e-12)
-    place = reach.flatten(1).clamp(0.0, 1.0) * bins
-    below = place.long().clamp(max=bins - 1)
-    limit = torch.lerp(cumulative.gather(1, below), cumulative.gather(1, below + 1), place - below)
-    wanted = u.flatten(1) * limit
+    wanted = u.flatten(1) * interpolated(cumulative, reach.flatten(1) * bins)
     upper = torch.searchsorted(cumulative, wanted.contiguous(), right=True).clamp(1, bins)
     first, last = cumulative.gather(1, upper - 1), cumulative.gather(1, upper)
     inside = (wanted - first) / (last - first).clamp_min(1e-12)
@@ -570,8 +567,7 @@ def _wrong_response(true: Tensor, random: Random) -> tuple[_Response, Tensor]:
 
     Its deviation is wrong by up to a factor of 2. Who knows no better has measured the offset with it, too.
     """
-    place = torch.arange(-_TAPS, _TAPS + 1, device=true.device)
-    width = (true * place.square()).sum(dim=1, keepdim=True).sqrt() * random.log_between(_WRONG, 1)
+    width = deviation(true, 0.0)[:, None] * random.log_between(_WRONG, 1)
     width, none = width.clamp(0.3, _TAPS / 3.0), torch.zeros_like(width)
     found = _Response(width, width, none, none, none + 1.0)
     shift = torch.arange(-60.0, 61.0, device=true.device)[:, None] * 0.1

@@ -9,9 +9,8 @@ from scipy.stats import expon, norm
 
 from helpers.stepped_frames import denoised
 from spadwarp.denoise import apply, estimate, inference, synthetic_noise
-from spadwarp.denoise.histogram_network import HistogramNet, answer, log_likelihood
+from spadwarp.denoise.histogram_network import HistogramNet, answer, light_channels, log_likelihood
 from spadwarp.denoise.histograms import count_frames, target_bins
-from spadwarp.denoise.late_light import light_channels
 from spadwarp.denoise.recipe import Noise
 
 BINS, SIGMA = 128, 1.2  # bins of the gate, response [bins]
