@@ -147,15 +147,17 @@ def _filled(depth: NDArray[np.float32], density: NDArray[np.float32]) -> NDArray
 
 def fill_missing(image: NDArray[np.float32], otherwise: float) -> NDArray[np.float32]:
     """An image `[H, W]` with each NaN replaced by its nearest number, or all by `otherwise` where there is none."""
-    from scipy.ndimage import distance_transform_edt
-
     missing = np.isnan(image)
     if missing.all():
         return np.full_like(image, otherwise)
-    if not missing.any():
-        return image
-    nearest = distance_transform_edt(missing, return_distances=False, return_indices=True)
-    return image[tuple(nearest)]
+    return image[nearest(missing)] if missing.any() else image
+
+
+def nearest(missing: NDArray[np.bool_]) -> tuple[NDArray[np.int32], ...]:
+    """Of each element, the index of the nearest that is not missing."""
+    from scipy.ndimage import distance_transform_edt
+
+    return tuple(distance_transform_edt(missing, return_distances=False, return_indices=True))
 
 
 # The part of a gate that holds the target: networks are more accurate in a gate that is not much wider than that.

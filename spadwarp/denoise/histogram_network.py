@@ -18,7 +18,7 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
-from spadwarp.denoise.classical import beliefs, highest, pooled
+from spadwarp.denoise.classical import beliefs, deviation, highest, interpolated, log_likelihood, pooled
 
 CELL = 4
 """Bins of a cell."""
@@ -36,51 +36,6 @@ _VOLUMES = 2 + len(WINDOWS)
 _LIGHT = 14  # channels of `light_channels`
 _CELLS, _IMAGES = _VOLUMES + 2, _VOLUMES + 3 + _LIGHT  # channels of cells, and of images, that the pyramid sees
 _LEAST = 20.0  # differences of log-likelihoods within a pixel are clipped at this for the pyramid
-_LEAST_SIGNAL = 0.05  # counts
-_UNIFORM_SHARE = 0.3  # part of the signal that may come at any time, so that photons far from the return say little
-
-
-def toeplitz(response: Tensor, bins: int) -> Tensor:
-    """Response `[B, 2 r + 1]` in bin j to a return in bin k, `[B, j, k]`."""
-    radius = response.shape[-1] // 2
-    place = torch.arange(bins, device=response.device)
-    distance = place[:, None] - place
-    inside = distance.abs() <= radius
-    return torch.where(inside, response[:, (distance + radius).clamp(0, 2 * radius)], 0.0)
-
-
-def log_likelihood(counts: Tensor, background: Tensor, response: Tensor) -> Tensor:
-    """Log-likelihood ratio of a return in each bin, less what background alone gives on average, `[B, H, W, T]`.
-
-    Σ_j (n_j − B_j) ln(1 + S h_{j−k} / B'_j), so that dim pixels are not drawn to where background is high. S is the
-    mean signal of the frame, h the response, B' the background plus 0.3 S spread evenly over the gate. The sum over
-    pixels is that of the pixels together.
-
-    Args:
-        counts: Histograms over the gate, `[B, H, W, T]`.
-        background: Expected background counts, > 0, of each pixel `[B, H, W, T]` or the same for all `[B, 1, 1, T]`.
-        response: Instrument response per bin centred on its time zero, sum 1, `[B, 2 r + 1]`.
-    """
-    above, bins = counts - background, counts.shape[-1]
-    signal = above.sum(dim=-1).mean(dim=(1, 2)).clamp_min(_LEAST_SIGNAL)
-    floor = background.mean(dim=(1, 2)) + _UNIFORM_SHARE * signal[:, None] / bins
-    template = torch.log1p(signal[:, None, None] / floor[:, :, None] * toeplitz(response, bins))
-    return torch.bmm(above.flatten(1, 2), template).view_as(above)
-
-
-def deviation(response: Tensor, least: float) -> Tensor:
-    """Standard deviation of responses `[B, 2 r + 1]` about their time zero, `[B]` [bins]; its square is >= `least`."""
-    offset = torch.arange(response.shape[-1], device=response.device) - response.shape[-1] // 2
-    return (response * offset.square()).sum(dim=-1).clamp_min(least).sqrt()
-
-
-def interpolated(cumulative: Tensor, place: Tensor) -> Tensor:
-    """Of cumulative counts at the edges of bins `[..., T + 1]`, those before places `[..., E]` [bins]."""
-    bins = cumulative.shape[-1] - 1
-    place = place.clamp(0.0, float(bins))
-    below = place.long().clamp(max=bins - 1)
-    cumulative = cumulative.expand(*place.shape[:-1], bins + 1)
-    return torch.lerp(cumulative.gather(-1, below), cumulative.gather(-1, below + 1), place - below)
 
 
 def rebinned(counts: Tensor, background: Tensor, response: Tensor, merged: int) -> tuple[Tensor, Tensor, Tensor]:

@@ -22,6 +22,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from spadwarp.arrays import on_host, real_array
+from spadwarp.denoise.frames import nearest
 from spadwarp.denoise.network_files import require_torch, torch_device
 from spadwarp.frames.backgrounds import Background, BackgroundLaw, bins_of_target, estimate_background, return_width
 from spadwarp.frames.measured import Histograms
@@ -168,8 +169,7 @@ def second_return(
         side: Of the window over which histograms are pooled; 1 for each pixel alone.
     """
     torch = require_torch()
-    from spadwarp.denoise.classical import highest, pooled
-    from spadwarp.denoise.histogram_network import deviation, toeplitz
+    from spadwarp.denoise.classical import deviation, highest, pooled, toeplitz
 
     first, cubes = real_array("depth", depth), np.asarray(on_host(counts))
     if first.shape != cubes.shape[:-1]:
@@ -302,14 +302,10 @@ def _wrong_pixels(
 
 def repaired(counts: NDArray[Any], found: Defects) -> NDArray[Any]:
     """The counts with those of the nearest good pixel and bin in place of each defect: none of its own are used."""
-    from scipy.ndimage import distance_transform_edt
-
     if found.bins.any():
-        source = distance_transform_edt(found.bins, return_distances=False, return_indices=True)[0]
-        counts = counts[..., source]
+        counts = counts[..., *nearest(found.bins)]
     if found.pixels.any():
-        rows, columns = distance_transform_edt(found.pixels, return_distances=False, return_indices=True)
-        counts = counts[..., rows, columns, :]
+        counts = counts[..., *nearest(found.pixels), :]
     return counts
 
 

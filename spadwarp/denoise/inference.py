@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple, get_args
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from spadwarp.denoise.baselines import BASELINES, CLASSICAL, MEDIAN_WINDOWS, classical_depth, median_filter
+from spadwarp.denoise.baselines import BASELINES, CLASSICAL, MEDIAN_WINDOWS, median_filter
 from spadwarp.denoise.frames import DepthFrames, checked_gate, depth_frames, depth_values, narrowed_input
 from spadwarp.denoise.histograms import CountFrames, merged_bins, target_bins, without_defects
 from spadwarp.denoise.network_files import MODELS, Precision, fast_precision, load_network, require_torch, torch_device
@@ -220,22 +220,28 @@ def estimate_histograms(
     device: str | None,
 ) -> Estimate:
     """`estimate` for the methods that use counts, in the bins that hold the target; `bin_width` is in depth [m]."""
+    require_torch()
+    from spadwarp.denoise.classical import classical_depth
+
     frames = frames.part(bins)
     if model in CLASSICAL:
-        counts, background, response = frames[:3]
-        given: dict[str, Any] = {"background": background, "response": response, "device": device}
-        place = classical_depth(counts, method=model, **given)  # type: ignore[arg-type]
+        place = classical_depth(frames, method=model, device=device)  # type: ignore[arg-type]
         found = np.stack([place, np.ones_like(place), np.full_like(place, np.nan)])
     else:
-        found = _by_network(frames, weights, device)
-        empty = ~((depth > 0) & np.isfinite(depth)).reshape(found.shape[1:]).any(axis=(1, 2))
-        found[0, empty], found[1, empty] = np.nan, 0.0
+        found = _empty_where(depth, _by_network(frames, weights, device))
     found[0] = to_depth(found[0])
     found = found.reshape(3, *depth.shape)
     response = frames.response
     if np.max(response) >= _COARSE * np.sum(response):  # histograms tell no place within a bin; the pixel's light does
         found[0] = np.where(np.abs(depth - found[0]) < bin_width, depth, found[0])
     return Estimate(*found)
+
+
+def _empty_where(depth: NDArray[Any], found: NDArray[np.float32]) -> NDArray[np.float32]:
+    """The arrays of an `Estimate`, `[3, N, H, W]`, without depth and target in frames without any report."""
+    empty = ~((depth > 0) & np.isfinite(depth)).reshape(found.shape[1:]).any(axis=(1, 2))
+    found[0, empty], found[1, empty] = np.nan, 0.0
+    return found
 
 
 _MARGIN = 32  # pixels around a part of a large frame that are seen, too
@@ -348,17 +354,14 @@ def estimate_frames(
             probability, confidence = reported.float(), torch.full_like(found, torch.nan)
             if output.shape[1] > 1:
                 probability, confidence = output[:, 1:3].sigmoid_().unbind(dim=1)
-            some_seen = reported.flatten(1).any(dim=1)[:, None, None]
-            answers[0, some] = torch.where(some_seen, found, torch.nan)
-            answers[1, some] = torch.where(some_seen, probability, 0.0)
-            answers[2, some] = confidence
+            answers[:, some] = torch.stack([found, probability, confidence])
         if progress is not None:
             progress("frames", min(first + part, len(frames.depth)), len(frames.depth))
     if not finite:  # values beyond the range of float16, or weights that are not finite
         if kind == "float32" or precision is not None:
             raise ArgumentError(f"precision = {kind!r}: the network {model!r} gave values that are not finite")
         return estimate_frames(frames, model=model, weights=weights, device=device, precision="float32")
-    return Estimate(*answers.numpy())
+    return Estimate(*_empty_where(frames.depth, answers.numpy()))
 
 
 def _baseline(frames: DepthFrames, model: str, window: int, weights: str | Path | None) -> Estimate:
@@ -368,10 +371,8 @@ def _baseline(frames: DepthFrames, model: str, window: int, weights: str | Path 
     if window < 1 or window % 2 == 0:
         raise ArgumentError(f"window = {window} is not an odd number >= 1, such as {MEDIAN_WINDOWS}")
     found = median_filter(frames, window=window) if model == "median" else BASELINES[model](frames)
-    reported = ~np.isnan(frames.depth)
-    empty = ~reported.any(axis=(1, 2), keepdims=True)
-    found = np.where(empty, np.float32(np.nan), found)
-    return Estimate(found, reported.astype(np.float32), np.full_like(frames.depth, np.nan))
+    answers = np.stack([found, ~np.isnan(frames.depth), np.full_like(found, np.nan)]).astype(np.float32)
+    return Estimate(*_empty_where(frames.depth, answers))
 
 
 def corrected_target(logit: Tensor, depth: Tensor, reported: Tensor, share: Tensor) -> Tensor:

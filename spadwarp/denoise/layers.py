@@ -94,14 +94,9 @@ def turned(image: NDArray[np.int64], element: int) -> NDArray[np.int64]:
 @lru_cache(maxsize=1)
 def _left_quotients() -> NDArray[np.int64]:
     """Index of g⁻¹ h for elements g and h, `[8, 8]`."""
-    probe = np.arange(9).reshape(3, 3)
-    images = [turned(probe, element).tolist() for element in range(GROUP)]
-    table = np.empty((GROUP, GROUP), np.int64)
-    for g in range(GROUP):
-        for other in range(GROUP):  # g ∘ other = h
-            product = turned(turned(probe, other), g).tolist()
-            table[g, images.index(product)] = other
-    return table
+    places = np.stack([turned(np.arange(9).reshape(3, 3), element).ravel() for element in range(GROUP)])
+    products = places[:, places]  # of each element, after each g
+    return (products[:, :, None] == places).all(axis=-1).argmax(axis=0)
 
 
 @lru_cache(maxsize=32)

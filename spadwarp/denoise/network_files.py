@@ -46,14 +46,14 @@ def load_network(
     torch = require_torch()
     from safetensors.torch import load_file
 
-    from spadwarp.denoise.networks import build_network
+    from spadwarp.denoise.networks import NETWORKS
 
     path = _weights_path(model, weights)
     named = _header(path).get("model", model)
     if named != model:
         raise FileError(f"{path}: weights of {named!r}, not of {model!r}")
     try:
-        network: Any = build_network(model)
+        network: Any = NETWORKS[model]()
         values = {name: value.float() for name, value in load_file(path).items()}  # counters are cast back
         network.load_state_dict(values)
         if wrong := [name for name, value in values.items() if not torch.isfinite(value).all()]:

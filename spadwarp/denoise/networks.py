@@ -146,14 +146,9 @@ def _apart(rows: int, columns: int, device: torch.device) -> Tensor:
 @lru_cache(maxsize=1)
 def _directions() -> tuple[tuple[int, int], ...]:
     """The neighbour beside a pixel, and the one at its corner, turned by each element of `GROUP`."""
-    places = []
-    for start in ((1, 2), (2, 2)):
-        for element in range(GROUP):
-            probe = np.zeros((3, 3), np.int64)
-            probe[start] = 1
-            row, column = np.argwhere(turned(probe, element))[0]
-            places.append((int(row) - 1, int(column) - 1))
-    return tuple(places)
+    images = [turned(np.arange(9).reshape(3, 3), element) for element in range(GROUP)]
+    places = (np.argwhere(image == pixel)[0] - 1 for pixel in (5, 8) for image in images)
+    return tuple((int(row), int(column)) for row, column in places)
 
 
 class _Residual(nn.Module):
@@ -384,8 +379,3 @@ NETWORKS: dict[str, Callable[[], nn.Module]] = {
     "histograms": HistogramNet,
 }
 """Networks by the name that recipes and commands use."""
-
-
-def build_network(name: str) -> nn.Module:
-    """A network of `NETWORKS` with new weights."""
-    return NETWORKS[name]()

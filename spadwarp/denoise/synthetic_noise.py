@@ -19,9 +19,8 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
-from spadwarp.denoise.classical import highest
+from spadwarp.denoise.classical import deviation, highest, interpolated, toeplitz
 from spadwarp.denoise.frames import LOG_DENSITY_LIMIT, MARGIN
-from spadwarp.denoise.histogram_network import deviation, interpolated, toeplitz
 from spadwarp.denoise.recipe import Noise
 
 _THINGS = 10  # at most, in a scene
@@ -47,8 +46,8 @@ class Random:
     def coin(self, probability: float, *shape: int) -> Tensor:
         return self.uniform(*shape) < probability
 
-    def normal(self, shape: torch.Size) -> Tensor:
-        return torch.randn(shape, generator=self.generator, device=self.generator.device)
+    def normal(self, *shape: int) -> Tensor:
+        return torch.randn((self.size, *shape), generator=self.generator, device=self.generator.device)
 
     def integer(self, stop: int, *shape: int) -> Tensor:
         return torch.randint(stop, (self.size, *shape), generator=self.generator, device=self.generator.device)
@@ -65,7 +64,7 @@ def draw_scenes(count: int, side: int, generator: torch.Generator, *, finer: int
     depth = _background(side, random, finer)
     together = random.coin(0.35)  # things that are parts of one body
     centre, place = 0.3 * side * (2 * random.uniform(2) - 1), random.between((0.15, 0.85))
-    paint = 0.5 * random.normal(torch.Size((count, 1, 1))) * torch.ones_like(depth)  # ln of reflectance, negative
+    paint = 0.5 * random.normal(1, 1) * torch.ones_like(depth)  # ln of reflectance, negative
     number = torch.where(random.coin(0.15), 0, 1 + random.integer(_THINGS))
     far = torch.ones_like(place)  # as much smaller are all things
     if finer > 1:
@@ -84,18 +83,15 @@ def draw_scenes(count: int, side: int, generator: torch.Generator, *, finer: int
                 surface = z[chosen, None, None] + surface
                 drawn = inside & (surface > -0.1) & ~(surface >= depth[chosen])
                 depth[chosen] = torch.where(drawn, surface, depth[chosen])
-                paint[chosen] = torch.where(drawn, 0.5 * part.normal(torch.Size((len(chosen), 1, 1))), paint[chosen])
+                paint[chosen] = torch.where(drawn, 0.5 * part.normal(1, 1), paint[chosen])
     metres = 15.0 + relief * (depth - 0.5)
-    grain = 0.5 * random.uniform(1, 1) * random.coin(0.3, 1, 1) * random.normal(depth.shape)  # from pixel to pixel
+    grain = 0.5 * random.uniform(1, 1) * random.coin(0.3, 1, 1) * random.normal(*depth.shape[1:])  # from pixel to pixel
     texture = 0.5 * smooth_noise(count, side * finer, generator) + 0.3 * _pattern(side, random, finer)
     texture = torch.exp(texture + paint + grain)
     if finer > 1:
         texture *= _steepness(metres * finer / random.log_between((0.01, 0.12), 1, 1)).square().add(1.0) ** 0.25
     sigma = torch.where(torch.isfinite(metres), _JITTER * texture.clamp(0.3, 4.0), math.nan)
-    low = torch.where(torch.isfinite(metres), metres, math.inf).flatten(1).amin(dim=1)
-    high = torch.where(torch.isfinite(metres), metres, -math.inf).flatten(1).amax(dim=1)
-    empty = low > high
-    low, high = torch.where(empty, 14.5, low), torch.where(empty, 15.5, high)
+    low, high = _extent(metres, metres.isfinite(), metres.new_tensor([[14.5, 15.5]]))
     margins = random.log_between((0.02, 2.0), 2)
     return metres, sigma, torch.stack([low - margins[:, 0], high + margins[:, 1]], dim=1)
 
@@ -105,7 +101,7 @@ def smooth_noise(count: int, side: int, generator: torch.Generator) -> Tensor:
     total = torch.zeros((count, 1, side, side), device=generator.device)
     random = Random(count, generator)
     for cells in (3, 6, 12, 24):
-        coarse = random.normal(torch.Size((count, 1, cells, cells)))
+        coarse = random.normal(1, cells, cells)
         weight = random.uniform(1, 1, 1) * (3.0 / cells) ** 0.5
         total += weight * F.interpolate(coarse, size=(side, side), mode="bicubic", align_corners=False)
     return total[:, 0]
@@ -160,6 +156,12 @@ def _pattern(side: int, random: Random, finer: int) -> Tensor:
 # Shapes: where they are, and their relative depth about their own, at coordinates y, x [pixels] `[S, side, side]`.
 
 
+def _within(y: Tensor, x: Tensor, limits: tuple[float, float], random: Random) -> Tensor:
+    """A rectangle."""
+    extent = random.log_between(limits, 2, 1, 1)
+    return (x.abs() < extent[:, 0]) & (y.abs() < extent[:, 1])
+
+
 def _plate(y: Tensor, x: Tensor, random: Random) -> tuple[Tensor, Tensor]:
     """A slanted polygon of three to six sides."""
     inside = torch.ones_like(x, dtype=torch.bool)
@@ -208,8 +210,7 @@ def _net(y: Tensor, x: Tensor, random: Random) -> tuple[Tensor, Tensor]:
     second = torch.where(random.coin(0.5, 1, 1), 1.0, random.between((0.4, 2.5), 1, 1)) * pitch
     bent = y + 3.0 * torch.sin(x / 17.0 + 6 * random.uniform(1, 1)) * random.coin(0.5, 1, 1)
     lines = (_from_lines(x, pitch) < half) | (_from_lines(bent, second) < half)
-    extent = random.log_between((20.0, 120.0), 2, 1, 1)
-    inside = (x.abs() < extent[:, 0]) & (y.abs() < extent[:, 1])
+    inside = _within(y, x, (20.0, 120.0), random)
     return lines & inside, random.between((-0.4, 0.4), 1, 1) * x / 120.0 + 0.03 * torch.sin(y / 23.0)
 
 
@@ -256,8 +257,7 @@ def _blocks(y: Tensor, x: Tensor, random: Random) -> tuple[Tensor, Tensor]:
     row, column = (y / pitch[:, 0]).floor(), (x / pitch[:, 1]).floor()
     hashed = torch.sin(12.9898 * row + 78.233 * column + 100.0 * random.uniform(1, 1)) * 43758.5453
     height = hashed - hashed.floor()
-    extent = random.log_between((10.0, 80.0), 2, 1, 1)
-    inside = (x.abs() < extent[:, 0]) & (y.abs() < extent[:, 1]) & (height > random.between((-0.5, 0.5), 1, 1))
+    inside = _within(y, x, (10.0, 80.0), random) & (height > random.between((-0.5, 0.5), 1, 1))
     return inside, -random.between((0.02, 0.5), 1, 1) * height
 
 
@@ -275,15 +275,13 @@ def _sieve(y: Tensor, x: Tensor, random: Random) -> tuple[Tensor, Tensor]:
     hole = random.log_between((0.7, 4.0), 2, 1, 1)
     slit = random.coin(0.5, 1, 1)
     open_ = (_from_lines(x, pitch[:, 0]) < hole[:, 0]) & (slit | (_from_lines(y, pitch[:, 1]) < hole[:, 1]))
-    extent = random.log_between((12.0, 120.0), 2, 1, 1)
-    inside = (x.abs() < extent[:, 0]) & (y.abs() < extent[:, 1])
+    inside = _within(y, x, (12.0, 120.0), random)
     return inside & ~open_, (random.between((-0.4, 0.4), 1, 1) * x + random.between((-0.4, 0.4), 1, 1) * y) / 100.0
 
 
 def _sea(y: Tensor, x: Tensor, random: Random) -> tuple[Tensor, Tensor]:
     """A sheet with round waves, flat to steep."""
-    extent = random.log_between((15.0, 120.0), 2, 1, 1)
-    inside = (x.abs() < extent[:, 0]) & (y.abs() < extent[:, 1])
+    inside = _within(y, x, (15.0, 120.0), random)
     height = random.log_between((0.02, 0.4), 1, 1)
     return inside, height * torch.sin(x / random.log_between((2.0, 15.0), 1, 1)) + 0.2 * height * torch.sin(y / 9.0)
 
@@ -398,7 +396,7 @@ def _report(crops: _Crops, noise: Noise, random: Random, always_replaced: bool) 
     """Reported depths over the gate, and which pixels report, `[B, h, w]`: the target's, or backscatter's."""
     clean, sigma, hit, reach, profile, camera, _, _ = crops
     start, width = camera[:, 0, None, None], camera[:, 1, None, None]
-    reported = clean + sigma * random.normal(clean.shape)
+    reported = clean + sigma * random.normal(*clean.shape[1:])
     late = (sigma * random.between((0.5, 3.0), 1, 1)) * -torch.log1p(-random.uniform(*clean.shape[1:]))
     reported = reported + torch.where(random.coin(noise.tail, 1, 1), late, 0.0)
     none = random.coin(0.0 if always_replaced else 0.1)
@@ -502,7 +500,7 @@ def _cut(scenes: CleanScenes, index: Tensor, crop: int, random: Random, finer: i
 
 
 def _extent(depth: Tensor, hit: Tensor, gate: Tensor) -> tuple[Tensor, Tensor]:
-    """Nearest and farthest depth of each crop; the scene's gate where it sees nothing."""
+    """Nearest and farthest depth of each image `[B, h, w]`; the gate `[1 or B, 2]` where it sees nothing."""
     low = torch.where(hit, depth, math.inf).flatten(1).amin(dim=1)
     high = torch.where(hit, depth, -math.inf).flatten(1).amax(dim=1)
     seen = hit.flatten(1).any(dim=1)
@@ -633,7 +631,7 @@ def _draw_counts(
     rate += level[:, None, None] * bright[..., None] * from_before
     counts = torch.poisson(rate.add_(1e-4), generator=generator)
     level = level * torch.where(random.coin(noise.wrong, 1), random.log_between(_WRONG, 1), 1.0)
-    height, slope = (random.normal(torch.Size((len(clean), 1))) * random.coin(0.5, 1) for _ in range(2))
+    height, slope = (random.normal(1) * random.coin(0.5, 1) for _ in range(2))
     level = level * torch.exp(_ESTIMATED[0] * height + _ESTIMATED[1] * slope * (place - 0.5))
     return counts, level, given
 
@@ -696,7 +694,7 @@ def _scattered(rate: Tensor, noise: Noise, generator: torch.Generator) -> Tensor
         across = torch.matmul(spread(width, scale * factor)[:, None], late)
         light += part[:, None, None, None] * torch.bmm(spread(height, scale * factor), across.flatten(2)).view_as(rate)
     rough = random.between(noise.roughness, 1, 1)[..., None]
-    light *= random.normal(rate.shape).mul_(rough).sub_(0.5 * rough.square()).exp_()
+    light *= random.normal(*rate.shape[1:]).mul_(rough).sub_(0.5 * rough.square()).exp_()
     thin = 1.0 - torch.exp(-random.log_between((0.01, 3.0), 1, 1))
     share = torch.where(random.coin(noise.halo, 1, 1), thin, random.uniform(1, 1))
     return torch.lerp(rate, light, share[..., None])

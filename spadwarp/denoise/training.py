@@ -21,11 +21,11 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
-from spadwarp.denoise.classical import highest
-from spadwarp.denoise.histogram_network import CLOSE, answer, log_likelihood, mean_depth
+from spadwarp.denoise.classical import highest, log_likelihood
+from spadwarp.denoise.histogram_network import CLOSE, answer, mean_depth
 from spadwarp.denoise.layers import fixed_order
 from spadwarp.denoise.network_files import load_network, torch_device
-from spadwarp.denoise.networks import build_network
+from spadwarp.denoise.networks import NETWORKS
 from spadwarp.denoise.recipe import LEAST_CROP, LEVELS, Noise, Part, TrainingRecipe
 from spadwarp.denoise.synthetic_noise import COUNT_BINS, SUBPIXELS, Batch, CleanScenes, draw_batch, procedural_scenes
 from spadwarp.io.paths import atomic_path
@@ -251,7 +251,7 @@ class Run:
         self.recipe, self.folder, self.device, is_cuda = recipe, folder, device, device.type == "cuda"
         self.log, self.checkpoint = folder / "log.jsonl", folder / "checkpoint.pt"
         torch.manual_seed(recipe.seed)
-        network: Any = build_network(recipe.model)
+        network: Any = NETWORKS[recipe.model]()
         if recipe.start is not None:
             network.load_state_dict(load_network(recipe.start).state_dict(), strict=False)
         self.counting = recipe.model == "histograms"

@@ -16,9 +16,9 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from spadwarp.denoise.baselines import MEDIAN_WINDOWS, TUNINGS, classical_depth
+from spadwarp.denoise.baselines import MEDIAN_WINDOWS, TUNINGS
 from spadwarp.denoise.frames import DepthFrames, depth_frames
-from spadwarp.denoise.histograms import CountFrames
+from spadwarp.denoise.histograms import CountFrames, count_frames
 from spadwarp.denoise.inference import (
     FROM_COUNTS,
     METHODS,
@@ -139,8 +139,11 @@ def evaluate_fresh(
 
 def fresh_score(scene: FreshScene, *, weights: str | Path | None = None, device: str | None = None) -> FreshScore:
     """The scores of one scene."""
+    from spadwarp.denoise.classical import classical_depth
+
     seen, (start, stop) = np.isfinite(scene.clean), scene.gate
-    given: dict[str, Any] = {"background": scene.background, "response": scene.response, "device": device}
+    frames = count_frames(scene.counts, scene.background, scene.response)
+    given: dict[str, Any] = {"response": scene.response, "device": device, "min_significance": 0.0, "weights": weights}
     rmse: dict[str, float] = {}
 
     def metres(part: NDArray[Any]) -> NDArray[np.float32]:
@@ -151,7 +154,7 @@ def fresh_score(scene: FreshScene, *, weights: str | Path | None = None, device:
 
     for method, tunings in TUNINGS.items():
         for tuning in tunings:
-            depth = metres(classical_depth(scene.counts, method=method, tuning=tuning, **given)[0])  # type: ignore[arg-type]
+            depth = metres(classical_depth(frames, method=method, tuning=tuning, device=device)[0])
             judge(f"{method} {tuning:g}", depth)
             if method == "likelihood":
                 first = depth
@@ -160,8 +163,7 @@ def fresh_score(scene: FreshScene, *, weights: str | Path | None = None, device:
         judge(f"median {window}", filtered.depth[0])
     shares = []
     for name, background in (("histograms", scene.background), ("histograms, own background", "decay")):
-        options = {**given, "background": background, "min_significance": 0.0, "weights": weights}
-        answer = estimate(first, gate=scene.gate, counts=scene.counts, **options)
+        answer = estimate(first, gate=scene.gate, counts=scene.counts, background=background, **given)
         assert answer.significance is not None
         target = (answer.target_probability >= target_threshold("histograms")) & (answer.significance >= 4.0)
         judge(name, answer.depth)

@@ -9,7 +9,8 @@ from scipy.stats import expon, norm
 
 from helpers.stepped_frames import denoised
 from spadwarp.denoise import apply, estimate, inference, synthetic_noise
-from spadwarp.denoise.histogram_network import HistogramNet, answer, light_channels, log_likelihood
+from spadwarp.denoise.classical import log_likelihood
+from spadwarp.denoise.histogram_network import HistogramNet, answer, light_channels
 from spadwarp.denoise.histograms import count_frames, target_bins
 from spadwarp.denoise.recipe import Noise
 
