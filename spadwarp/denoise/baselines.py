@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from spadwarp.denoise.frames import DepthFrames, fill_missing
+from spadwarp.denoise.network_files import MODELS
 from spadwarp.values import SpadwarpError
 
 Frames = NDArray[np.float32]
@@ -92,7 +93,7 @@ BASELINES: dict[str, Callable[[DepthFrames], Frames]] = {
 """Baselines by name."""
 
 
-# Estimates of depth from histograms: the likelihood of pixels, of pooled pixels, and of whole frames
+# Names of the methods that estimate depth from counts, and of all.
 
 
 Classical = Literal["likelihood", "pooled", "semi-global", "total-variation", "belief-propagation"]
@@ -100,11 +101,8 @@ Classical = Literal["likelihood", "pooled", "semi-global", "total-variation", "b
 CLASSICAL: tuple[Classical, ...] = get_args(Classical)
 """Classical estimates from histograms."""
 
-TUNINGS: dict[Classical, tuple[float, ...]] = {
-    "likelihood": (1,),
-    "pooled": (3, 5, 7, 11, 15),
-    "semi-global": (5.0, 10.0, 20.0, 40.0),
-    "total-variation": (0.5, 1.0, 2.0, 4.0),
-    "belief-propagation": (2.5, 4.0, 8.0, 16.0),
-}
-"""Tuned values: sides of the window [pixels], penalties of a jump [nats], strengths."""
+METHODS = (*MODELS, *(name for name in BASELINES if name != "input"), *CLASSICAL)
+"""Models of `spadwarp.denoise.estimate`."""
+
+FROM_COUNTS = ("histograms", *CLASSICAL)
+"""Those that use counts."""

@@ -29,7 +29,8 @@ def classical_depth(
     `"total-variation"`: of the likelihood depth, each pixel weighted by how far its likelihood stands out.
     `"belief-propagation"`: on the likelihoods, the strongest of these in most cases.
 
-    `tuning`: see `TUNINGS`; default: 7 pixels, `usual_jump`, strength 1, a penalty of 4 nats.
+    `tuning`: side of the window [pixels], odd, penalty of a jump [nats], or strength; default: 7 pixels, `usual_jump`,
+    strength 1, 4 nats.
     """
     found = []
     with torch.inference_mode():

@@ -150,14 +150,14 @@ def fill_missing(image: NDArray[np.float32], otherwise: float) -> NDArray[np.flo
     missing = np.isnan(image)
     if missing.all():
         return np.full_like(image, otherwise)
-    return image[nearest(missing)] if missing.any() else image
+    return image[tuple(nearest(missing))] if missing.any() else image
 
 
-def nearest(missing: NDArray[np.bool_]) -> tuple[NDArray[np.int32], ...]:
-    """Of each element, the index of the nearest that is not missing."""
+def nearest(missing: NDArray[np.bool_]) -> NDArray[np.int32]:
+    """Of each element, the indices of the nearest that is not missing, `[dimensions, …]`."""
     from scipy.ndimage import distance_transform_edt
 
-    return tuple(distance_transform_edt(missing, return_distances=False, return_indices=True))
+    return np.asarray(distance_transform_edt(missing, return_distances=False, return_indices=True))
 
 
 # The part of a gate that holds the target: networks are more accurate in a gate that is not much wider than that.

@@ -303,9 +303,10 @@ def _wrong_pixels(
 def repaired(counts: NDArray[Any], found: Defects) -> NDArray[Any]:
     """The counts with those of the nearest good pixel and bin in place of each defect: none of its own are used."""
     if found.bins.any():
-        counts = counts[..., *nearest(found.bins)]
+        counts = counts[..., nearest(found.bins)[0]]
     if found.pixels.any():
-        counts = counts[..., *nearest(found.pixels), :]
+        rows, columns = nearest(found.pixels)
+        counts = counts[..., rows, columns, :]
     return counts
 
 

@@ -12,10 +12,10 @@ from typing import TYPE_CHECKING, Any, NamedTuple, get_args
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from spadwarp.denoise.baselines import BASELINES, CLASSICAL, MEDIAN_WINDOWS, median_filter
+from spadwarp.denoise.baselines import BASELINES, CLASSICAL, FROM_COUNTS, METHODS, median_filter
 from spadwarp.denoise.frames import DepthFrames, checked_gate, depth_frames, depth_values, narrowed_input
 from spadwarp.denoise.histograms import CountFrames, merged_bins, target_bins, without_defects
-from spadwarp.denoise.network_files import MODELS, Precision, fast_precision, load_network, require_torch, torch_device
+from spadwarp.denoise.network_files import Precision, fast_precision, load_network, require_torch, torch_device
 from spadwarp.frames.backgrounds import BackgroundLaw, profile_of_depth
 from spadwarp.frames.depth import arrival_time
 from spadwarp.frames.response import FWHM_PER_SIGMA, InstrumentResponse
@@ -31,12 +31,6 @@ if TYPE_CHECKING:
 _WATER = -2.2  # logits below it, and above 0, are sure enough to count how pixels of water, and of the target, report
 _PRIOR = 30.0  # pixels of the target whose reports are assumed to be as those of the water
 _LARGEST = 3.0  # correction of a logit
-
-METHODS = (*MODELS, *(name for name in BASELINES if name != "input"), *CLASSICAL)
-"""Models of `apply`."""
-
-FROM_COUNTS = ("histograms", *CLASSICAL)
-"""Those that use counts."""
 
 _ROWS = 64  # whose counts are summed at once: little memory
 _PIXELS_AT_ONCE = {"cpu": 1 << 16, "cuda": 1 << 23}  # a batch that fits into a CPU's cache is faster
@@ -313,7 +307,7 @@ def estimate_frames(
 ) -> Estimate:
     """`estimate` for frames `[N, H, W]`.
 
-    `model` may also be "input", the frames as they are; `window`: side of the median [pixels]. Networks without an
+    `model` may also be "input", the frames as they are; `window`: side of the median, odd [pixels]. Networks without an
     answer of their own for a pixel give it the gate's end.
     """
     if model != "input":
@@ -368,8 +362,6 @@ def _baseline(frames: DepthFrames, model: str, window: int, weights: str | Path 
     """`estimate_frames` for one of `BASELINES`."""
     if weights is not None:
         raise ArgumentError(f"weights are for a network, not for {model!r}")
-    if window < 1 or window % 2 == 0:
-        raise ArgumentError(f"window = {window} is not an odd number >= 1, such as {MEDIAN_WINDOWS}")
     found = median_filter(frames, window=window) if model == "median" else BASELINES[model](frames)
     answers = np.stack([found, ~np.isnan(frames.depth), np.full_like(found, np.nan)]).astype(np.float32)
     return Estimate(*_empty_where(frames.depth, answers))

@@ -14,9 +14,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from spadwarp.dataset import FrameItem, FrameReader, read_manifest
-from spadwarp.denoise.baselines import MEDIAN_WINDOWS
+from spadwarp.denoise.baselines import FROM_COUNTS, MEDIAN_WINDOWS, METHODS
 from spadwarp.denoise.frames import DepthFrames, depth_frames
-from spadwarp.denoise.inference import FROM_COUNTS, METHODS, estimate_frames, target_threshold
+from spadwarp.denoise.inference import estimate_frames, target_threshold
 from spadwarp.denoise.network_files import compared
 from spadwarp.values import ArgumentError, FileError, check_choice, check_integer
 

@@ -19,9 +19,9 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from spadwarp.denoise.baselines import MEDIAN_WINDOWS
+from spadwarp.denoise.baselines import FROM_COUNTS, MEDIAN_WINDOWS, METHODS
 from spadwarp.denoise.frames import DepthFrames, depth_frames
-from spadwarp.denoise.inference import FROM_COUNTS, METHODS, Estimate, estimate_frames, target_threshold
+from spadwarp.denoise.inference import Estimate, estimate_frames, target_threshold
 from spadwarp.denoise.network_files import compared
 from spadwarp.denoise.recipe import LEVELS
 from spadwarp.evaluation.datasets import Steps, near_jumps, staircase_steps

@@ -16,17 +16,10 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from spadwarp.denoise.baselines import MEDIAN_WINDOWS, TUNINGS
+from spadwarp.denoise.baselines import FROM_COUNTS, MEDIAN_WINDOWS, METHODS, Classical
 from spadwarp.denoise.frames import DepthFrames, depth_frames
 from spadwarp.denoise.histograms import CountFrames, count_frames
-from spadwarp.denoise.inference import (
-    FROM_COUNTS,
-    METHODS,
-    estimate,
-    estimate_frames,
-    estimate_histograms,
-    target_threshold,
-)
+from spadwarp.denoise.inference import estimate, estimate_frames, estimate_histograms, target_threshold
 from spadwarp.denoise.network_files import compared
 from spadwarp.frames.cramer_rao import crlb_from_histogram
 from spadwarp.frames.depth import arrival_time
@@ -40,6 +33,16 @@ if TYPE_CHECKING:
     from spadwarp.result.result import Result
 
 __all__ = ["FreshScores", "PhotonSweep", "draw_photon_sweep", "evaluate_fresh", "photon_sweep"]
+
+
+TUNINGS: dict[Classical, tuple[float, ...]] = {
+    "likelihood": (1,),
+    "pooled": (3, 5, 7, 11, 15),
+    "semi-global": (5.0, 10.0, 20.0, 40.0),
+    "total-variation": (0.5, 1.0, 2.0, 4.0),
+    "belief-propagation": (2.5, 4.0, 8.0, 16.0),
+}
+"""Tuned values: sides of the window [pixels], penalties of a jump [nats], strengths."""
 
 
 class FreshScore(NamedTuple):
