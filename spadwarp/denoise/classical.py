@@ -19,6 +19,15 @@ from spadwarp.denoise.histograms import CountFrames
 from spadwarp.device import start_warp
 from spadwarp_kernels.detection import launch_messages
 
+TUNINGS: dict[Classical, tuple[float, ...]] = {
+    "likelihood": (1,),
+    "pooled": (3, 5, 7, 11, 15),
+    "semi-global": (5.0, 10.0, 20.0, 40.0),
+    "total-variation": (0.5, 1.0, 2.0, 4.0),
+    "belief-propagation": (2.5, 4.0, 8.0, 16.0),
+}
+"""Tuned values: sides of the window [pixels], penalties of a jump [nats], strengths."""
+
 
 def classical_depth(
     frames: CountFrames, *, method: Classical, tuning: float | None = None, device: str | None = None
@@ -29,8 +38,7 @@ def classical_depth(
     `"total-variation"`: of the likelihood depth, each pixel weighted by how far its likelihood stands out.
     `"belief-propagation"`: on the likelihoods, the strongest of these in most cases.
 
-    `tuning`: side of the window [pixels], odd, penalty of a jump [nats], or strength; default: 7 pixels, `usual_jump`,
-    strength 1, 4 nats.
+    `tuning`: see `TUNINGS`; default: 7 pixels, `usual_jump`, strength 1, a penalty of 4 nats.
     """
     found = []
     with torch.inference_mode():

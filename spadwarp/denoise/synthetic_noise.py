@@ -27,6 +27,26 @@ _THINGS = 10  # at most, in a scene
 _JITTER = 0.004  # deviation of a reported depth [m]; a recipe's sigma_scale multiplies it
 
 
+BINS = 64
+"""Bins of a backscatter profile over the gate."""
+
+SUBPIXELS = 3
+"""Rows and columns of subpixels in each pixel of the scenes behind histograms: a pixel sees an area, not a point."""
+
+
+class CleanScenes(NamedTuple):
+    """Clean scenes on the training device, float32; H and W of pixels, or of subpixels."""
+
+    depth: Tensor  # [S, H, W] [m]; NaN where nothing is hit
+    sigma: Tensor  # Cramér–Rao bound of depth, [S, H, W] [m]; NaN where there is none
+    gate: Tensor  # start and stop in depth, [S, 2] [m]
+    profile: Tensor  # density of backscatter over the gate, mean 1, [S, BINS]
+
+    def to(self, device: torch.device | str) -> CleanScenes:
+        """The same on another device."""
+        return CleanScenes(*(values.to(device) for values in self))
+
+
 @dataclass(frozen=True, eq=False)
 class Random:
     """Random numbers for `size` samples from one generator, in the order of the calls."""
@@ -53,12 +73,13 @@ class Random:
         return torch.randint(stop, (self.size, *shape), generator=self.generator, device=self.generator.device)
 
 
-def draw_scenes(count: int, side: int, generator: torch.Generator, *, finer: int = 1) -> tuple[Tensor, Tensor, Tensor]:
-    """Depth and its deviation `[S, side, side]`, NaN where there is only water, and gates around it `[S, 2]` [m].
+def procedural_scenes(count: int, side: int, *, seed: int, device: torch.device | str, finer: int = 1) -> CleanScenes:
+    """Scenes in water of flat backscatter, with gates around them.
 
     With `finer` they are of so many rows and columns of subpixels in each pixel, in part from farther away, and steep
     surfaces are darker.
     """
+    generator = torch.Generator(device).manual_seed(seed)
     random = Random(count, generator)
     relief = random.log_between((0.08, 2.5), 1, 1)  # of the whole scene [m]
     depth = _background(side, random, finer)
@@ -86,20 +107,20 @@ def draw_scenes(count: int, side: int, generator: torch.Generator, *, finer: int
                 paint[chosen] = torch.where(drawn, 0.5 * part.normal(1, 1), paint[chosen])
     metres = 15.0 + relief * (depth - 0.5)
     grain = 0.5 * random.uniform(1, 1) * random.coin(0.3, 1, 1) * random.normal(*depth.shape[1:])  # from pixel to pixel
-    texture = 0.5 * smooth_noise(count, side * finer, generator) + 0.3 * _pattern(side, random, finer)
+    texture = 0.5 * smooth_noise(random, side * finer) + 0.3 * _pattern(side, random, finer)
     texture = torch.exp(texture + paint + grain)
     if finer > 1:
         texture *= _steepness(metres * finer / random.log_between((0.01, 0.12), 1, 1)).square().add(1.0) ** 0.25
     sigma = torch.where(torch.isfinite(metres), _JITTER * texture.clamp(0.3, 4.0), math.nan)
     low, high = _extent(metres, metres.isfinite(), metres.new_tensor([[14.5, 15.5]]))
     margins = random.log_between((0.02, 2.0), 2)
-    return metres, sigma, torch.stack([low - margins[:, 0], high + margins[:, 1]], dim=1)
+    gate = torch.stack([low - margins[:, 0], high + margins[:, 1]], dim=1)
+    return CleanScenes(metres, sigma, gate, torch.ones(count, BINS, device=metres.device))
 
 
-def smooth_noise(count: int, side: int, generator: torch.Generator) -> Tensor:
-    """Fields of noise over several scales, deviation about 1, `[count, side, side]`."""
-    total = torch.zeros((count, 1, side, side), device=generator.device)
-    random = Random(count, generator)
+def smooth_noise(random: Random, side: int) -> Tensor:
+    """Fields of noise over several scales, deviation about 1, `[S, side, side]`."""
+    total = torch.zeros((random.size, 1, side, side), device=random.generator.device)
     for cells in (3, 6, 12, 24):
         coarse = random.normal(1, cells, cells)
         weight = random.uniform(1, 1, 1) * (3.0 / cells) ** 0.5
@@ -123,7 +144,7 @@ def _background(side: int, random: Random, finer: int) -> Tensor:
     count, device = random.size, random.generator.device
     y, x = _turned(torch.zeros(count, 2, device=device), side, random, finer)
     kind = random.uniform()[:, None, None]
-    rough = 0.15 * random.uniform(1, 1) * random.coin(0.6, 1, 1) * smooth_noise(count, side * finer, random.generator)
+    rough = 0.15 * random.uniform(1, 1) * random.coin(0.6, 1, 1) * smooth_noise(random, side * finer)
     slope = 0.6 * (2 * random.uniform(1, 1) - 1) * random.coin(0.7, 1, 1)
     wall = 1.0 + slope * x / side + rough
     nearest, horizon = random.between((0.0, 0.7), 1, 1), random.between((-0.6, 0.5), 1, 1)
@@ -245,7 +266,7 @@ def _chain(y: Tensor, x: Tensor, random: Random) -> tuple[Tensor, Tensor]:
 
 def _rock(y: Tensor, x: Tensor, random: Random) -> tuple[Tensor, Tensor]:
     """A patch of thresholded noise, whose relief is the noise."""
-    noise = smooth_noise(random.size, x.shape[-1], random.generator)
+    noise = smooth_noise(random, x.shape[-1])
     fade = (x.square() + y.square()).sqrt() / random.log_between((15.0, 80.0), 1, 1)
     height = noise + 1.0 - 1.5 * fade
     return height > 0.0, -random.between((0.0, 0.25), 1, 1) * height.clamp(0.0, 2.0)
@@ -293,9 +314,6 @@ KINDS = (_plate, _ellipsoid, _rod, _rope, _net, _ladder, _plant, _chain, _rock, 
 # Crops, and the noise of a camera.
 
 
-BINS = 64
-"""Bins of a backscatter profile over the gate."""
-
 COUNT_BINS = (64, 96, 128, 192, 256, 400)
 """Bins of the histograms behind frames with few photons, one number for each batch."""
 
@@ -304,23 +322,6 @@ _WRONG = (0.5, 2.0)  # factors on a background, and on the width of a response, 
 _FLOOR = 0.01  # part of the signal that may come in any bin, where a response is fitted
 _ESTIMATED = 0.03, 0.1  # deviations of height and slope, relative, of a background that is estimated from the frame
 _TAPS = 32  # a response extends over this many bins to each side
-
-
-SUBPIXELS = 3
-"""Rows and columns of subpixels in each pixel of the scenes behind histograms: a pixel sees an area, not a point."""
-
-
-class CleanScenes(NamedTuple):
-    """Clean scenes on the training device, float32; H and W of pixels, or of subpixels."""
-
-    depth: Tensor  # [S, H, W] [m]; NaN where nothing is hit
-    sigma: Tensor  # Cramér–Rao bound of depth, [S, H, W] [m]; NaN where there is none
-    gate: Tensor  # start and stop in depth, [S, 2] [m]
-    profile: Tensor  # density of backscatter over the gate, mean 1, [S, BINS]
-
-    def to(self, device: torch.device | str) -> CleanScenes:
-        """The same on another device."""
-        return CleanScenes(*(values.to(device) for values in self))
 
 
 class Batch(NamedTuple):
@@ -342,13 +343,6 @@ class _Crops(NamedTuple):
     camera: Tensor  # start and width of that gate, which is wider, [B, 2]
     seen: Tensor  # depth of the subpixels of each pixel, NaN where there is none, [B, n, h, w]
     bound: Tensor  # its bound
-
-
-def procedural_scenes(count: int, side: int, *, seed: int, device: torch.device | str, finer: int = 1) -> CleanScenes:
-    """Scenes of `draw_scenes`, in water of flat backscatter."""
-    generator = torch.Generator(device).manual_seed(seed)
-    depth, sigma, gate = draw_scenes(count, side, generator, finer=finer)
-    return CleanScenes(depth, sigma, gate, torch.ones(count, BINS, device=depth.device))
 
 
 def draw_batch(
@@ -643,7 +637,7 @@ def _second_surface(clean: Tensor, hit: Tensor, noise: Noise, random: Random) ->
     """
     side = clean.shape[-1]
     apart = random.between((0.03, 0.4), 1, 1) * (1.0 - 2.0 * random.coin(0.5, 1, 1).float())
-    veiled = smooth_noise(len(clean), side, random.generator)[:, : clean.shape[1]] > random.between((-0.5, 1.0), 1, 1)
+    veiled = smooth_noise(random, side)[:, : clean.shape[1]] > random.between((-0.5, 1.0), 1, 1)
     beside = random.coin(0.5, 1, 1)
     second = torch.where(beside, clean.roll(1, 2), (clean + apart).clamp(0.01, 0.99))
     there = hit & torch.where(beside, hit.roll(1, 2) & ((second - clean).abs() > 0.005), veiled)

@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from spadwarp.denoise.baselines import FROM_COUNTS, MEDIAN_WINDOWS, METHODS, Classical
+from spadwarp.denoise.baselines import FROM_COUNTS, MEDIAN_WINDOWS, METHODS
 from spadwarp.denoise.frames import DepthFrames, depth_frames
 from spadwarp.denoise.histograms import CountFrames, count_frames
 from spadwarp.denoise.inference import estimate, estimate_frames, estimate_histograms, target_threshold
@@ -33,16 +33,6 @@ if TYPE_CHECKING:
     from spadwarp.result.result import Result
 
 __all__ = ["FreshScores", "PhotonSweep", "draw_photon_sweep", "evaluate_fresh", "photon_sweep"]
-
-
-TUNINGS: dict[Classical, tuple[float, ...]] = {
-    "likelihood": (1,),
-    "pooled": (3, 5, 7, 11, 15),
-    "semi-global": (5.0, 10.0, 20.0, 40.0),
-    "total-variation": (0.5, 1.0, 2.0, 4.0),
-    "belief-propagation": (2.5, 4.0, 8.0, 16.0),
-}
-"""Tuned values: sides of the window [pixels], penalties of a jump [nats], strengths."""
 
 
 class FreshScore(NamedTuple):
@@ -142,7 +132,7 @@ def evaluate_fresh(
 
 def fresh_score(scene: FreshScene, *, weights: str | Path | None = None, device: str | None = None) -> FreshScore:
     """The scores of one scene."""
-    from spadwarp.denoise.classical import classical_depth
+    from spadwarp.denoise.classical import TUNINGS, classical_depth
 
     seen, (start, stop) = np.isfinite(scene.clean), scene.gate
     frames = count_frames(scene.counts, scene.background, scene.response)
@@ -257,11 +247,10 @@ def photon_sweep(
             bound[row, column] += float(np.mean(np.minimum(sigma[seen], guess) ** 2)) / frames
             for name, sums in squares.items():  # a median of each window is tried; the others have one variant
                 for total, window in zip(sums, MEDIAN_WINDOWS, strict=False):
-                    options = {"device": device, **methods[name]}
-                    if options["model"] in FROM_COUNTS:
-                        found = estimate_histograms(noisy.depth, **histograms, **options)
+                    if methods[name]["model"] in FROM_COUNTS:
+                        found = estimate_histograms(noisy.depth, **histograms, device=device, **methods[name])
                     else:
-                        found = estimate_frames(noisy, window=window, **options)
+                        found = estimate_frames(noisy, window=window, device=device, **methods[name])
                     total[row, column] += float(np.mean((found.depth[0][seen] - truth[seen]) ** 2)) / frames
             done += 1
             if progress is not None:
