@@ -21,7 +21,7 @@ from spadwarp.frames.depth import arrival_time
 from spadwarp.frames.response import FWHM_PER_SIGMA, InstrumentResponse
 from spadwarp.values import ArgumentError, SpadwarpWarning, check_choice, check_real
 
-__all__ = ["METHODS", "Estimate", "apply", "estimate"]
+__all__ = ["METHODS", "Estimate", "estimate"]
 
 
 if TYPE_CHECKING:
@@ -52,32 +52,9 @@ class Estimate(NamedTuple):
     `spadwarp.arrival_time`. None without counts."""
 
     def masked(self, probability: float) -> NDArray[np.float32]:
-        """Depth, NaN where a target is less probable than `probability`."""
+        """Depth, NaN where a target is less probable than `probability`; 0.5 makes as few errors as possible."""
+        probability = check_real("mask", probability, "[0, 1]")
         return np.where(self.target_probability >= probability, self.depth, np.float32(np.nan))
-
-
-def apply(
-    depth: ArrayLike, *, gate: tuple[float, float], mask: float | None = None, **options: Any
-) -> NDArray[np.float32]:
-    """Denoises depth frames.
-
-    Args:
-        depth: `[H, W]` or `[N, H, W]` [m], planar depth or range; NaN and 0 mean that nothing was reported.
-        gate: (start, stop) of the camera's gate, in depth or range as `depth` is [m]. Distances need not be those of
-            the training: networks see depth over the gate, or over the part of it that holds the target.
-        mask: Pixels that see a target with less than this probability become NaN; by default every pixel has a depth,
-            also where there is only water. 0.5 makes as few errors as possible.
-        options: The other arguments of `estimate`.
-
-    Returns:
-        float32 of `depth`'s shape [m]. A frame without any report stays empty.
-
-    Raises:
-        ArgumentError, SpadwarpError: See `estimate`.
-    """
-    mask = None if mask is None else check_real("mask", mask, "[0, 1]")
-    found = estimate(depth, gate=gate, **options)
-    return found.depth if mask is None else found.masked(mask)
 
 
 def estimate(
@@ -95,10 +72,12 @@ def estimate(
     precision: Precision | None = None,
     progress: Callable[[str, int, int], None] | None = None,
 ) -> Estimate:
-    """Depth, and the probabilities that a pixel sees a target and that its depth is right.
+    """Denoises depth frames: depth, and the probabilities that a pixel sees a target and that its depth is right.
 
     Args:
-        depth, gate: See `apply`.
+        depth: `[H, W]` or `[N, H, W]` [m], planar depth or range; NaN and 0 mean that nothing was reported.
+        gate: (start, stop) of the camera's gate, in depth or range as `depth` is [m]. Distances need not be those of
+            the training: networks see depth over the gate, or over the part of it that holds the target.
         model: "pyramid", "dncnn" or "usdn"; or a baseline: "median", "gating", "bm3d". With counts, "pyramid" means
             "histograms", the network that uses them; "likelihood", "pooled", "semi-global",
             "total-variation" and "belief-propagation" are classical estimates from counts.

@@ -8,7 +8,7 @@ from scipy.ndimage import convolve1d, gaussian_filter
 from scipy.stats import expon, norm
 
 from helpers.stepped_frames import denoised
-from spadwarp.denoise import apply, estimate, inference, synthetic_noise
+from spadwarp.denoise import estimate, inference, synthetic_noise
 from spadwarp.denoise.classical import log_likelihood
 from spadwarp.denoise.histogram_network import HistogramNet, answer, light_channels
 from spadwarp.denoise.histograms import count_frames, target_bins
@@ -212,6 +212,6 @@ def test_depths_far_from_the_counts_are_answered():
 def test_masked_pixels_and_tensors_are_depth_too():
     values, options = np.full((16, 16), 15.0), {"gate": (14.0, 16.0), "model": "median"}
     masked, holes = np.ma.masked_array(values, np.eye(16) > 0), np.where(np.eye(16) > 0, np.nan, values)
-    np.testing.assert_array_equal(apply(masked, **options), apply(holes, **options))
+    np.testing.assert_array_equal(*(denoised(depth, **options) for depth in (masked, holes)))
     learned = torch.tensor(values, requires_grad=True)
-    np.testing.assert_array_equal(apply(learned, **options), values.astype(np.float32))
+    np.testing.assert_array_equal(denoised(learned, **options), values.astype(np.float32))
