@@ -86,9 +86,6 @@ class _Conv(nn.Conv3d):
     """Convolution over cells, rows and columns `[B, N, H, W, n]`, by one over rows and columns of which cells beside
     each other are channels: several times faster, on a GPU too, than one over three dimensions."""
 
-    def __init__(self, before: int, after: int, length: int) -> None:
-        super().__init__(before, after, (3, 3, length))
-
     def forward(self, x: Tensor) -> Tensor:
         if self.kernel_size[2] == 1:
             return self._convolved(x)
@@ -111,9 +108,6 @@ class _Conv(nn.Conv3d):
 class _Shrink(nn.Conv3d):
     """Half as many rows, columns and, of `length` 2, cells, as a product of matrices."""
 
-    def __init__(self, before: int, after: int, length: int) -> None:
-        super().__init__(before, after, (2, 2, length))
-
     def forward(self, x: Tensor) -> Tensor:
         length = self.kernel_size[2]
         parts = x.unflatten(3, (-1, 2)).unflatten(2, (-1, 2)).unflatten(1, (-1, length))  # [B, N, ·, H, 2, W, 2, n]
@@ -123,9 +117,6 @@ class _Shrink(nn.Conv3d):
 
 class _Enlarge(nn.ConvTranspose3d):
     """Twice as many rows, columns and, of `length` 2, cells; as `_Shrink`."""
-
-    def __init__(self, before: int, after: int, length: int) -> None:
-        super().__init__(before, after, (2, 2, length))
 
     def forward(self, x: Tensor) -> Tensor:  # type: ignore[override]
         filters = self.weight.permute(0, 4, 2, 3, 1).flatten(1)
@@ -137,7 +128,7 @@ class _Enlarge(nn.ConvTranspose3d):
 class _Residual(nn.Module):
     def __init__(self, width: int, length: int) -> None:
         super().__init__()
-        self.layers = nn.ModuleList(_Conv(width, width, length) for _ in range(2))
+        self.layers = nn.ModuleList(_Conv(width, width, (3, 3, length)) for _ in range(2))
         nn.init.zeros_(self.layers[-1].weight)  # type: ignore[arg-type]  # begins as the identity
 
     def forward(self, x: Tensor) -> Tensor:
@@ -153,10 +144,10 @@ class _Pyramid(nn.Module):
     def __init__(self, widths: tuple[int, ...], *, volumes: bool) -> None:
         super().__init__()
         pairs, length, side = list(pairwise(widths)), 3 if volumes else 1, 2 if volumes else 1
-        self.down = nn.ModuleList(_Shrink(wide, narrow, side) for wide, narrow in pairs)
+        self.down = nn.ModuleList(_Shrink(wide, narrow, (2, 2, side)) for wide, narrow in pairs)
         self.before = nn.ModuleList(_Residual(width, length) for width in widths[1:])
         self.deep = _Residual(widths[-1], length)
-        self.up = nn.ModuleList(_Enlarge(narrow, wide, side) for wide, narrow in pairs)
+        self.up = nn.ModuleList(_Enlarge(narrow, wide, (2, 2, side)) for wide, narrow in pairs)
         self.after = nn.ModuleList(_Residual(width, length if level else 1) for level, width in enumerate(widths[:-1]))
         self.stride, self.side = 2 ** len(pairs), side
 
@@ -185,13 +176,13 @@ class HistogramNet(nn.Module):
     ) -> None:
         super().__init__()
         first = widths[0]
-        self.enter = _Conv(_CELLS, first, 1)
+        self.enter = _Conv(_CELLS, first, (3, 3, 1))
         self.enter_image = nn.Sequential(
             nn.Conv2d(_IMAGES, 32, 3, padding=1), nn.ReLU(), nn.Conv2d(32, first, 3, padding=1)
         )
         self.pyramid = _Pyramid(widths, volumes=True)
         self.head = nn.Linear(first, _VOLUMES + 1)
-        self.enter_target = _Conv(2 * first + _IMAGES, target_widths[0], 1)
+        self.enter_target = _Conv(2 * first + _IMAGES, target_widths[0], (3, 3, 1))
         self.target_pyramid = _Pyramid(target_widths, volumes=False)
         self.target = nn.Linear(target_widths[0], 1)
         self.stride = self.pyramid.stride

@@ -222,12 +222,12 @@ _AT_ONCE = 7 << 20  # bins of all pixels that are computed at once: in float32 l
 _LEAST_PART = 96  # pixels of a side: smaller parts would see more of others than of their own
 
 
-def _parts(length: int, most: int) -> list[tuple[slice, slice]]:
-    """A side in equal parts of at most so many pixels: what is answered, and what is seen for it."""
+def _parts(length: int, most: int) -> list[tuple[slice, slice, slice]]:
+    """A side in equal parts of at most so many pixels: what is answered, what is seen for it, and where in this."""
     count = -(-length // most)
     step = -(-length // (16 * count)) * 16  # whole strides of the network
-    firsts = range(0, length, step)
-    return [(slice(one, one + step), slice(max(0, one - _MARGIN), one + step + _MARGIN)) for one in firsts]
+    parts = [(first, max(0, first - _MARGIN), first + step) for first in range(0, length, step)]
+    return [(slice(one, stop), slice(low, stop + _MARGIN), slice(one - low, stop - low)) for one, low, stop in parts]
 
 
 def _by_network(given: CountFrames, weights: str | Path | None, device: str | None) -> NDArray[np.float32]:
@@ -241,11 +241,10 @@ def _by_network(given: CountFrames, weights: str | Path | None, device: str | No
     network, merged = load_network("histograms", weights, str(torch_device(device))), merged_bins(bins, given.response)
     most = max(_LEAST_PART, math.isqrt(_AT_ONCE * merged // bins) - 2 * _MARGIN)
     with torch.inference_mode():
-        for (rows, seen_rows), (columns, seen_columns) in product(_parts(height, most), _parts(width, most)):
+        parts = product(_parts(height, most), _parts(width, most))
+        for (rows, seen_rows, inner_rows), (columns, seen_columns, inner_columns) in parts:
             seen = np.s_[..., seen_rows, seen_columns, :]
             part = given._replace(counts=frames[seen], background=level[seen] if level.ndim == 3 else level)
-            sides = (rows, seen_rows), (columns, seen_columns)
-            inner = tuple(slice(one.start - around.start, one.stop - around.start) for one, around in sides)
             for image, (cube, known, taps) in zip(found.swapaxes(0, 1), part.tensors(device), strict=True):
                 if merged > 1:
                     cube, known, taps = rebinned(cube, known, taps, merged)
@@ -254,7 +253,7 @@ def _by_network(given: CountFrames, weights: str | Path | None, device: str | No
                 depth *= merged * cube.shape[-1] / bins  # the last of merged bins may reach beyond the gate
                 depth += 0.5 * (merged % 2 == 0) / bins  # an even number has no middle: the response is the next's
                 answers = torch.cat([depth, target.sigmoid(), confidence])
-                image[:, rows, columns] = answers[:, *inner].cpu().numpy()
+                image[:, rows, columns] = answers[:, inner_rows, inner_columns].cpu().numpy()
     return found
 
 

@@ -208,9 +208,7 @@ class PyramidNet(nn.Module):
             assert self.scalars.bias is not None
             self.near.bias[0] = 3.0  # of the pixel itself
             for window in self.wide:
-                for bias in window.parameters(recurse=False):
-                    if bias.ndim == 1:
-                        bias.fill_(-2.0)
+                nn.init.constant_(window.bias, -2.0)  # type: ignore[arg-type]
             self.scalars.weight.mul_(0.3)
             self.scalars.bias.copy_(torch.tensor([-2.0, 0.0, 2.0, 0.0, 2.0, -1.0, 3.0]))
             # Begins with the depth voted for, and with features that count little: noise in the weights would at first

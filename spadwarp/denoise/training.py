@@ -150,9 +150,9 @@ def loss_of(output: Tensor, batch: Batch) -> Tensor:
     if logits.shape[1]:
         right = batch.hit * ((depth.detach() - batch.clean).abs() < CLOSE)
         true = batch.hit * ((batch.inputs[0][:, :1] - batch.clean).abs() < _NEAR)
-        error = error + _TARGET * _target_error(logits[:, :1], batch)
-        for part, truth in ((logits[:, 1:2], right), (logits[:, 2:], true)):
-            error = error + _OTHERS * F.binary_cross_entropy_with_logits(part, truth)
+        shares, truths = (_TARGET, _OTHERS, _OTHERS), (batch.hit, right, true)
+        for share, logit, truth in zip(shares, logits.split(1, dim=1), truths, strict=True):
+            error = error + share * F.binary_cross_entropy_with_logits(logit, truth)
     return error
 
 
@@ -172,18 +172,13 @@ def histogram_loss(log_probability: Tensor, target: Tensor, batch: Batch) -> Ten
     entropy = -torch.log(right + _OUTLIER)
     entropy = (hit * entropy).flatten(1).sum(dim=1) / pixels
     error = _mean_with_target(0.5 * torch.log(square + _FINE_FLOOR) + _BINS * entropy, hit)
-    return error + _SEEN * _target_error(target[:, None], batch)
+    return error + _SEEN * F.binary_cross_entropy_with_logits(target, hit)
 
 
 def _mean_with_target(error: Tensor, hit: Tensor) -> Tensor:
     """Mean over the crops that have a target."""
     with_target = (hit.flatten(1).mean(dim=1) > 0.005).float()
     return (with_target * error).sum() / with_target.sum().clamp_min(1.0)
-
-
-def _target_error(logit: Tensor, batch: Batch) -> Tensor:
-    """Cross-entropy of "sees a target"."""
-    return F.binary_cross_entropy_with_logits(logit, batch.hit)
 
 
 # Steps
