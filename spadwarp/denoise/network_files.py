@@ -11,7 +11,7 @@ from typing import Any, Literal
 
 from spadwarp.io.paths import existing_file
 from spadwarp.io.text import parse_json
-from spadwarp.values import ArgumentError, DeviceError, FileError, SpadwarpError, need_memory, shown
+from spadwarp.values import ArgumentError, DeviceError, FileError, SpadwarpError, check_choice, need_memory, shown
 
 __all__ = ["weights_metadata"]
 
@@ -120,8 +120,7 @@ def torch_device(name: str | None) -> Any:
 
 
 def _weights_path(model: str, weights: str | Path | None) -> Path:
-    if model not in MODELS:
-        raise ArgumentError(f"model = {model!r} is not one of {', '.join(map(repr, MODELS))}")
+    check_choice("model", model, MODELS)
     return existing_file(WEIGHTS / f"{model}.safetensors" if weights is None else weights)
 
 

@@ -164,7 +164,7 @@ class _Residual(nn.Module):
 
 _WIDEST = 0.1  # depths this far from the first answer still count for the second
 _NEAR = 5  # side of the window whose depths are taken as they are
-_BOXES = (9, 6), (36, 24)  # sides of the wider windows whose means are taken, and the pixels between them
+_BOXES = (9, 6, 1), (36, 24, 4)  # sides of wider windows whose means are taken, pixels between them, and their grid
 
 
 class PyramidNet(nn.Module):
@@ -325,8 +325,7 @@ def _candidates(depth: Tensor, reported: Tensor, true: Tensor) -> tuple[list[Ten
     values = _windows(depth, _NEAR, 1)
     trusts = _windows(F.logsigmoid(true) + 1e4 * (reported - 1.0), _NEAR, 1)
     both = torch.cat([certainty * depth, certainty], dim=1)
-    for box, step in _BOXES:
-        coarse = 1 if box < 16 else 4
+    for box, step, coarse in _BOXES:
         mean = F.avg_pool2d(both, coarse) if coarse > 1 else both
         side = box // coarse
         mean = F.avg_pool2d(mean, (side, 1), 1, (side // 2, 0))

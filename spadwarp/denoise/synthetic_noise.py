@@ -438,12 +438,11 @@ def _draw_crops(scenes: CleanScenes, noise: Noise, crop: int, random: Random, fi
     """Crops of random scenes, each with a gate and a water."""
     index = random.integer(len(scenes.depth))
     seen, bound = _cut(scenes, index, crop, random, finer)
-    depth, sigma = (image[:, seen.shape[1] // 2] for image in (seen, bound))
     if noise.resampled > 0.0:
         chosen = random.coin(noise.resampled, 1, 1, 1)
         means = (image.nanmean(dim=1, keepdim=True) for image in (seen, bound))
         seen, bound = (torch.where(chosen, *pair) for pair in zip(means, (seen, bound), strict=True))
-        depth, sigma = (image[:, seen.shape[1] // 2] for image in (seen, bound))
+    depth, sigma = (image[:, seen.shape[1] // 2] for image in (seen, bound))
     hit = torch.isfinite(depth) & torch.isfinite(sigma)
     gate = scenes.gate[index]
     own = random.coin(noise.own_gate)
