@@ -19,8 +19,15 @@ from spadwarp.dataset import FrameReader, read_manifest
 from spadwarp.dataset.shards import SceneFile
 from spadwarp.denoise.baselines import FROM_COUNTS
 from spadwarp.denoise.frames import MARGIN, checked_gate
-from spadwarp.denoise.histograms import CountFrames, dim_pixels, second_return, target_bins, without_defects
-from spadwarp.denoise.inference import Estimate, detected, estimate_depth, estimate_histograms, target_threshold
+from spadwarp.denoise.histograms import CountFrames, dim_pixels, target_bins, without_defects
+from spadwarp.denoise.inference import (
+    Estimate,
+    detected,
+    estimate_depth,
+    estimate_histograms,
+    second_return,
+    target_threshold,
+)
 from spadwarp.denoise.network_files import Precision, require_torch, weights_metadata
 from spadwarp.denoise.recipe import TrainingRecipe, load_training_recipe
 from spadwarp.files import Held, gate_of, holds_own_file, is_own_file, load, locate, sequence, stored_depth

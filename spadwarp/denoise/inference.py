@@ -7,21 +7,22 @@ import warnings
 from collections.abc import Callable
 from itertools import product
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, NamedTuple, get_args
+from typing import TYPE_CHECKING, Any, Literal, NamedTuple, get_args
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from spadwarp.arrays import on_host, real_array
 from spadwarp.denoise.baselines import BASELINES, CLASSICAL, FROM_COUNTS, METHODS, median_filter
 from spadwarp.denoise.frames import DepthFrames, checked_gate, depth_frames, depth_values, narrowed_input
-from spadwarp.denoise.histograms import CountFrames, merged_bins, target_bins, without_defects
-from spadwarp.denoise.network_files import Precision, fast_precision, load_network, require_torch, torch_device
+from spadwarp.denoise.histograms import CountFrames, count_frames, merged_bins, target_bins, without_defects
+from spadwarp.denoise.network_files import Precision, fast_precision, require_torch, torch_device
 from spadwarp.frames.backgrounds import BackgroundLaw, profile_of_depth
 from spadwarp.frames.depth import arrival_time
 from spadwarp.frames.response import FWHM_PER_SIGMA, InstrumentResponse
 from spadwarp.values import ArgumentError, SpadwarpWarning, check_choice, check_real
 
-__all__ = ["METHODS", "Estimate", "estimate"]
+__all__ = ["METHODS", "Estimate", "estimate", "second_return"]
 
 
 if TYPE_CHECKING:
@@ -234,6 +235,7 @@ def _by_network(given: CountFrames, weights: str | Path | None, device: str | No
     """Depth over the gate, target probability and confidence, `[3, N, H, W]`."""
     torch = require_torch()
     from spadwarp.denoise.histogram_network import answer, rebinned
+    from spadwarp.denoise.networks import load_network
 
     frames, level = given.counts.reshape(-1, *given.counts.shape[-3:]), given.background
     height, width, bins = frames.shape[1:]
@@ -297,6 +299,8 @@ def estimate_frames(
     if model in BASELINES:
         return _baseline(frames, model, window, weights)
     torch = require_torch()
+    from spadwarp.denoise.networks import load_network
+
     place = torch_device(device)
     if model != "pyramid":
         precision = "float32"
@@ -374,3 +378,58 @@ def corrected_target(logit: Tensor, depth: Tensor, reported: Tensor, share: Tens
     )
     logit = logit + torch.where(absent, of_absent, torch.where(beyond, of_beyond, 0.0))
     return logit + share.log().clamp_min(-_LARGEST)[:, None, None]
+
+
+_BY_CHANCE = 6.0  # log of the false second returns that are accepted, one in e^6 pixels
+
+
+def second_return(
+    depth: ArrayLike,
+    counts: ArrayLike,
+    *,
+    background: ArrayLike,
+    response: ArrayLike,
+    side: Literal[1, 3, 5, 7, 9] = 3,
+    device: str | None = None,
+) -> NDArray[np.float32]:
+    """Depth over the gate of a second return `[N, H, W]`; NaN where there is no significant one.
+
+    The first return is taken off each histogram: as many counts as lie in it, in the shape of the response. In what
+    remains, beyond the response, the counts of `side` × `side` pixels within the response's width have to exceed the
+    background by more than happens by chance in one of 400 pixels (Poisson likelihood ratio). Light that the water
+    scatters into a pixel from a brighter part of the target is such an excess, too: with hundreds of detections a pixel
+    most pixels have a second return.
+
+    Args:
+        depth: First return over the gate, 0 at its start and 1 at its end, `[H, W]` or `[N, H, W]`.
+        counts, background, response, device: See `estimate`, as for errors.
+        side: Of the window over which histograms are pooled; 1 for each pixel alone.
+    """
+    torch = require_torch()
+    from spadwarp.denoise.classical import deviation, highest, pooled, toeplitz
+
+    first, cubes = real_array("depth", depth), np.asarray(on_host(counts))
+    if first.shape != cubes.shape[:-1]:
+        raise ArgumentError(f"depth has shape {first.shape}; {cubes.shape[:-1]} is needed")
+    frames = first.reshape(-1, *first.shape[-2:])
+    found = []
+    with torch.inference_mode():
+        tensors = count_frames(cubes, background, response).tensors(device)
+        for place, (cube, level, taps) in zip(frames, tensors, strict=True):
+            bins = cube.shape[-1]
+            at = (torch.from_numpy(np.nan_to_num(place)).to(cube.device)[None] * bins).long().clamp(0, bins - 1)
+            width = float(deviation(taps, 0.1))
+            shape = toeplitz(taps, bins)[0].t()[at]  # of the first return in each pixel
+            near = (torch.arange(bins, device=cube.device) - at[..., None]).abs() <= 3.0 * width + 1.0
+            signal = ((cube - level) * near).sum(dim=-1, keepdim=True).clamp_min(0.0)
+            rest = torch.where(near, level.expand_as(cube), cube - signal * shape).clamp_min(0.0)
+            reach = 2 * round(1.5 * width) + 1
+            image = torch.cat([rest, level.expand_as(cube)])
+            image = pooled(image, side) * side**2
+            sums = torch.nn.functional.avg_pool1d(image.flatten(0, 2)[:, None], reach, 1, reach // 2)
+            found_counts, expected = (sums.view_as(image) * reach).split(1)
+            excess = torch.xlogy(found_counts, found_counts / expected) - (found_counts - expected)
+            score = torch.where(near | (found_counts <= expected), 0.0, excess)
+            significant = score.amax(dim=-1) > math.log(bins) + _BY_CHANCE
+            found.append(torch.where(significant, highest(score), math.nan)[0].cpu().numpy())
+    return np.stack(found).astype(np.float32)

@@ -12,15 +12,19 @@ from __future__ import annotations
 from collections.abc import Callable
 from functools import lru_cache
 from itertools import pairwise
-from typing import NamedTuple
+from pathlib import Path
+from typing import Any, NamedTuple
 
 import numpy as np
 import torch
 import torch.nn.functional as F
+from safetensors.torch import load_file
 from torch import Tensor, nn
 
 from spadwarp.denoise.histogram_network import HistogramNet, filled_up
 from spadwarp.denoise.layers import GROUP, SymmetricConv, SymmetricWindow, edge_padded, enlarged, turned
+from spadwarp.denoise.network_files import Precision, weights_header, weights_path
+from spadwarp.values import FileError
 
 
 class USDN(nn.Module):
@@ -376,3 +380,29 @@ NETWORKS: dict[str, Callable[[], nn.Module]] = {
     "histograms": HistogramNet,
 }
 """Networks by the name that recipes and commands use."""
+
+
+@lru_cache(maxsize=8)
+def load_network(
+    model: str, weights: str | Path | None = None, device: str = "cpu", precision: Precision = "float32"
+) -> Any:
+    """A network with its weights, ready to run; `precision`: of the layers of PyramidNet."""
+    path = weights_path(model, weights)
+    named = weights_header(path).get("model", model)
+    if named != model:
+        raise FileError(f"{path}: weights of {named!r}, not of {model!r}")
+    try:
+        network: Any = NETWORKS[model]()
+        values = {name: value.float() for name, value in load_file(path).items()}  # counters are cast back
+        network.load_state_dict(values)
+        if wrong := [name for name, value in values.items() if not torch.isfinite(value).all()]:
+            raise ValueError(f"{wrong[0]} is not finite")
+    except Exception as error:  # safetensors and torch have errors of their own
+        raise FileError(f"{path}: not weights of {model!r}: {error}") from error
+    # glibc returns memory to the system after each layer, and fresh pages take as long as the layer, unless a block
+    # this large (at most 32 MiB) was freed before: M_TRIM_THRESHOLD in mallopt(3).
+    torch.empty(31 << 20, dtype=torch.uint8)
+    network = network.to(torch.device(device), getattr(torch, precision))
+    if model != "histograms":
+        network = network.to(memory_format=torch.channels_last)
+    return network.eval().requires_grad_(False)

@@ -24,8 +24,8 @@ from torch import Tensor, nn
 from spadwarp.denoise.classical import highest, log_likelihood
 from spadwarp.denoise.histogram_network import CLOSE, answer, mean_depth
 from spadwarp.denoise.layers import fixed_order
-from spadwarp.denoise.network_files import load_network, torch_device
-from spadwarp.denoise.networks import NETWORKS
+from spadwarp.denoise.network_files import torch_device
+from spadwarp.denoise.networks import NETWORKS, load_network
 from spadwarp.denoise.recipe import LEAST_CROP, LEVELS, Noise, Part, TrainingRecipe
 from spadwarp.denoise.synthetic_noise import COUNT_BINS, SUBPIXELS, Batch, CleanScenes, draw_batch, procedural_scenes
 from spadwarp.io.paths import atomic_path

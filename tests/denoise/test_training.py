@@ -229,7 +229,7 @@ def test_a_training_starts_from_the_weights_of_the_package(tmp_path):
         tmp_path, scenes(count=1, size=32), model="histograms", start="histograms", noise=noise, optimiser=once
     )
     learnt = load_file(done.weights)
-    for name, values in network_files.load_network("histograms").state_dict().items():
+    for name, values in networks.load_network("histograms").state_dict().items():
         assert torch.allclose(learnt[name].float(), values, atol=0.01), name  # two steps
     validation = network_files.weights_metadata("histograms", done.weights)["validation_psnr"]
     assert set(validation) == {"1.000", "3.000", "10.000", "30.000", "100.000"}
