@@ -74,19 +74,12 @@ def detect(
     counted = min(shots, bins) if scene.detector.mode == "first_photon" else bins
     needed = max(frames, 0) * scene.camera.width * scene.camera.height * (4 * counted + 4 * len(methods) + 8)
     check_outputs(out, ("frames.h5", "frame.png"), inputs=(run,), needed=needed + (16 << 20))
+    if overrides:
+        opt.warn_of(scene)
     recording = spadwarp.frames.record_frames(
-        result,
-        out / "frames.h5",
-        pulses=pulses,
-        frames=frames,
-        seed=seed,
-        methods=methods,
-        undo_pile_up=coates,
-        tags=tags,
-        window=recorded,
-        device=device,
-        progress=progress("frames"),
-    )
+        result, out / "frames.h5", pulses=pulses, frames=frames, seed=seed, methods=methods, undo_pile_up=coates,
+        tags=tags, window=recorded, device=device, progress=progress("frames"),
+    )  # fmt: skip
     for text in (*recording.file.notes, *_bound_noise(recording, result.photons)):
         complain(text, "note")
     files = [recording.file.path, spadwarp.viz.draw(recording.file, out / "frame.png", pixel=pixel)]
@@ -304,6 +297,7 @@ def fit(
     read, (facts, files) = opt.read_scene(scene, overrides), opt.read_measured(inputs)
     names = spadwarp.files.fit_files(spadwarp.inverse.read_unknowns(read, unknown))
     check_outputs(out, names, inputs=(path, scene, *files, *read.files))
+    opt.warn_of(read)
     found = spadwarp.fit(
         spadwarp.files.locate(path), read, initial_guess=start, progress=progress(), **options, **facts
     )

@@ -209,7 +209,7 @@ def _terms(found: Proposal) -> dict[str, str]:
     return {title: "mm"} | {name: f"{short(1000 * value):<6}  {about[name]}" for name, value in found.terms.items()}
 
 
-@command()
+@command(prints_result=True)
 def sweep(
     scene: Path,
     *,
@@ -268,6 +268,7 @@ def sweep(
     draw: Any
     if of_range:
         values = spadwarp.analytic.parse_vary(texts[0])[1] if vary else None
+        opt.warn_of(read)
         lines = found = spadwarp.budget(read, values, medium or None, reflectance=reflectance, device=device)
         keys, draw = [{"water": row.medium} for row in found], spadwarp.viz.draw_budget
     else:

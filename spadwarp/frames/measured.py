@@ -27,7 +27,7 @@ from spadwarp.io.mat import SparseMatrix, Variable, open_mat
 from spadwarp.io.paths import existing_file, reading
 from spadwarp.result import Channel, analyser_channel, noise_problem
 from spadwarp.result.file import load_result
-from spadwarp.values import ArgumentError, FileError, SpadwarpWarning, check_real, shown
+from spadwarp.values import ArgumentError, FileError, Interval, SpadwarpWarning, check_real, shown
 
 __all__ = ["read_histograms"]
 
@@ -39,6 +39,7 @@ _LEAST_BINS = 8  # of a histogram that is worth one
 _CLEARLY = 2.0  # as far from a square as the other order of axes, and the choice is clear
 _MOST_BINS = 1_000_000  # as of a scene's gate
 _MOST_VALUES = 1 << 29  # 2 GiB of counts
+_TIMES = {"tag_unit": "(0, 1e-3) s", "bin_width": "(0, 1e-3) s", "gate_start": "[-1, 1] s"}
 _MARKERS = 16  # of T3 records; four today
 # What ptufile says about a damaged file stands in our errors, too.
 logging.getLogger("ptufile").addHandler(logging.NullHandler())
@@ -97,11 +98,9 @@ def read_histograms(
         ArgumentError: A fact that is missing, out of range, or that the file holds itself.
     """
     path = existing_file(path)
-    for name, value, within in (("tag_unit", tag_unit, "(0, 1e-3) s"), ("bin_width", bin_width, "(0, 1e-3) s")):
+    for name, value in {"tag_unit": tag_unit, "bin_width": bin_width, "gate_start": gate_start}.items():
         if value is not None:
-            check_real(name, value, within)
-    if gate_start is not None:
-        check_real("gate_start", gate_start, "[-1, 1] s")
+            check_real(name, value, _TIMES[name])
     given: dict[str, Any] = {"dataset": dataset, "axes": axes, "image_size": image_size, "tag_unit": tag_unit}
     if is_own(path):
         given |= {"irf": irf, "bin_width": bin_width, "sum_frames": sum_frames, "gate_start": gate_start}
@@ -132,21 +131,24 @@ def read_histograms(
     if gate_start is None and raw.gate_start is None:
         origin = f"{'tag' if raw.first else 'bin'} 0 is taken for the time of the pulse"
         warnings.warn(f"{path.name}: gate start is not given (gate_start): {origin}", SpadwarpWarning, stacklevel=2)
-    bin_width = raw.bin_width if bin_width is None else bin_width
+    bin_width = _fact("bin_width", bin_width, raw.bin_width, path)
     if irf is not None and bin_width is not None and not irf.fwhm < (length := values.shape[-1] * bin_width):
         raise ArgumentError(
             f"{path}: irf = {irf.fwhm:.4g} s (full width at half maximum) is outside [0, {length:.4g}) s: the "
             f"histograms are {length:.4g} s long; with a unit, write irf=300ps"
         )
     return Histograms(
-        values=np.ascontiguousarray(values),
-        bin_width=bin_width,
-        gate_start=(gate_start if gate_start is not None else raw.gate_start or 0.0) + raw.first,
-        group_index=raw.group_index,
-        irf=irf,
-        response=irf,
-        notes=tuple(notes),
-    )
+        values=np.ascontiguousarray(values), bin_width=bin_width,
+        gate_start=(_fact("gate_start", gate_start, raw.gate_start, path) or 0.0) + raw.first,
+        group_index=raw.group_index, irf=irf, response=irf, notes=tuple(notes),
+    )  # fmt: skip
+
+
+def _fact(name: str, given: float | None, held: float | None, path: Path) -> float | None:
+    """What is given, or else in the file. Raises `ArgumentError` where that is out of range."""
+    if given is None and held is not None and held not in Interval.read(_TIMES[name]):
+        raise ArgumentError(f"{path}: {name} = {held:g} is outside {_TIMES[name]}; give it, such as {name}=55ps")
+    return held if given is None else given
 
 
 def is_own(path: Path) -> bool:
@@ -160,26 +162,18 @@ def _read_own(path: Path, channel: Channel) -> Histograms:
             raise ArgumentError(f"channel = {channel!r}: {path} holds frames, whose channel was chosen when drawn")
         file = FramesFile.load(path)
         return Histograms(
-            values=file.counts(),
-            bin_width=file.bin_width,
-            gate_start=file.gate_start,
+            values=file.counts(), bin_width=file.bin_width, gate_start=file.gate_start,
             background=file.background * np.float32(file.pulses),
-            pulses=file.pulses if file.scene.detector.mode == "first_photon" else 0,
-            irf=file.irf,
-            response=file.irf,
+            pulses=file.pulses if file.scene.detector.mode == "first_photon" else 0, irf=file.irf, response=file.irf,
             scene=file.scene,
-        )
+        )  # fmt: skip
     result = analyser_channel(load_result(path), channel)
     scene = result.scene
     return Histograms(
-        values=result.expected(),
-        notes=tuple(filter(None, [noise_problem(result)])),
-        bin_width=scene.gate.bin_width,
-        gate_start=scene.gate.start,
-        background=result.expected("backscatter").astype(np.float32),
-        response=detector_response(scene.detector, scene.laser),
-        scene=scene,
-    )
+        values=result.expected(), notes=tuple(filter(None, [noise_problem(result)])), bin_width=scene.gate.bin_width,
+        gate_start=scene.gate.start, background=result.expected("backscatter").astype(np.float32),
+        response=detector_response(scene.detector, scene.laser), scene=scene,
+    )  # fmt: skip
 
 
 def _checked(values: NDArray[Any], path: Path) -> NDArray[Any]:
@@ -313,17 +307,16 @@ def _read_arrays(
         if tag_unit is None:
             raise ArgumentError(f"{path}: the unit of the time tags in {name} is missing (tag_unit)")
         return _of_tags(value, tag_unit, bin_width, notes)
-    width = numbers.get("bin_size", numbers.get("bin_width", 0.0))
-    known = width if 1e-15 < width < 1e-3 else None
-    if bin_width is None and known is not None:
-        notes.append(f"bin width {known * 1e12:g} ps from the file")
+    width = numbers.get("bin_size", numbers.get("bin_width"))
+    if bin_width is None and width is not None:
+        notes.append(f"bin width {width * 1e12:g} ps from the file")
     index = numbers.get("group_index", 0.0)
     is_sparse = isinstance(value, SparseMatrix)
     if is_sparse:
         value = _of_sparse(value, image_size, variables)
         notes.append(f"{value.shape[1]} x {value.shape[0]} pixels, column by column")
     options = ("dataset", "image_size" if is_sparse else "axes")[not name :]
-    facts = (known, numbers.get("gate_start"), index if 1.0 <= index <= 3.0 else None)
+    facts = (width, numbers.get("gate_start"), index if 1.0 <= index <= 3.0 else None)
     return _Raw(value, tuple(notes), *facts, ordered=is_sparse, options=options)
 
 
