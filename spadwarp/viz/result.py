@@ -246,10 +246,9 @@ def _result_figure(
 
 
 def _histogram_figure(result: Result, width: float, pixel: tuple[int, int] | None) -> Figure:
-    # By ballistic light on the target: in a short run a rare photon of large weight can make any pixel bright.
-    ballistic = result.expected("ballistic").sum(axis=2)
-    on_target = np.isfinite(result.truth.depth) & bool(ballistic.any())
-    pixels = _typical_pixels(np.where(on_target, ballistic, result.intensity), result.truth.depth, pixel)
+    light = sum(result.expected(name).sum(axis=2) for name in ("ballistic", "forward_scattered"))
+    on_target = np.isfinite(result.truth.depth) & bool(light.any())
+    pixels = _typical_pixels(np.where(on_target, light, result.intensity), result.truth.depth, pixel)
     unclear = unclear_pixels(result)
     figure = style.new_figure(width, 2.3 * max(len(pixels), 1))
     figure.caption(_caption(result))
@@ -522,7 +521,8 @@ def _frame_figure(
             raise ArgumentError(f"frame = {number} is outside [0, {1 if frames.summed else frames.frames})")
     counts = np.asarray(shown.counts if shown.summed else shown.counts[index])
     intensity = counts.sum(axis=-1)
-    light = np.asarray(shown.expected).sum(axis=-1)  # the brightest may have one photon of a large weight
+    on_target = np.isfinite(file.truth_depth) if file is not None else np.zeros(intensity.shape, bool)
+    light = (np.asarray(shown.expected) - np.asarray(shown.background) * on_target[..., None]).sum(axis=-1)
     pixels = _typical_pixels(light if light.any() else intensity, None if file is None else file.truth_depth, pixel)
     panels = Panels(intensity.shape, 2 if file is None else 4, width=width, below=(1.7,) * len(pixels))
     hatched = ""

@@ -493,7 +493,10 @@ def target_limits(truth: NDArray[Any], measured: NDArray[Any]) -> tuple[float, f
 
 
 def median_pixel(values: NDArray[Any], among: NDArray[np.bool_]) -> tuple[int, int]:
-    """Row and column of the median value among these pixels, or among all where there are none."""
+    """Row and column of a typical one of these pixels, or of all where there are none: of the third whose value is
+    nearest to the median, as in a plan, the one nearest to the middle. Small changes of the values seldom move it."""
     choice = np.flatnonzero(among | ~among.any())
-    order = choice[np.argsort(values.ravel()[choice], kind="stable")]
-    return divmod(int(order[(len(order) - 1) // 2]), values.shape[1])
+    off = np.abs(values.ravel()[choice] - np.nanmedian(values.ravel()[choice]))
+    rows, columns = np.divmod(choice[np.argsort(off, kind="stable")[: max(1, len(choice) // 3)]], values.shape[1])
+    at = np.hypot(rows - 0.5 * (values.shape[0] - 1), columns - 0.5 * (values.shape[1] - 1)).argmin()
+    return int(rows[at]), int(columns[at])
