@@ -347,7 +347,7 @@ def _check_plausible(survey: Survey) -> None:
     """What is implausible, and the size of meshes."""
     survey.messages += implausible(survey.moving or survey.scene)
     for index, (target, triangles) in enumerate(zip(survey.scene.targets, survey.targets, strict=True)):
-        if target.mesh is not None and len(triangles):
+        if len(triangles) and (target.mesh is not None or set(target.scale) != {1.0}):
             _check_mesh(survey, f"targets[{index}].scale", target.scale, np.ptp(triangles.reshape(-1, 3), axis=0))
 
 

@@ -52,6 +52,7 @@ def draw(path: Path, photons: int, device: str | None) -> None:
     image = draw_slice(side, scene, build_mesh(scene), 1)
     figure.colorbar(image, ax=side, label="extinction [1/m]")
     side.set_title("from the side")
+    side.legend(fontsize=6)
     times = _times(result)
     for name, (label, colour) in style.COMPONENTS.items():
         values = result.component(name)[18:30, 18:30].mean(axis=(0, 1))

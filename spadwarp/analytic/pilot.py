@@ -22,7 +22,7 @@ from spadwarp.analytic.model import pixel_maps
 from spadwarp.arrays import Floats
 from spadwarp.device import pick_device
 from spadwarp.frames import Frames, detect, detector_response, first_photon_probabilities, information_from_histogram
-from spadwarp.frames.depth import METHODS, arrival_time
+from spadwarp.frames.depth import METHODS, Method, arrival_time
 from spadwarp.frames.response import FWHM_PER_SIGMA
 from spadwarp.result import Channel, Result, analyser_channel, merge
 from spadwarp.scene import Scene, noise_rate
@@ -38,6 +38,8 @@ Mask = NDArray[np.bool_]
 
 _SIDE = 16  # largest width and height of the window [pixels]
 _MOST_NOISE = 0.95  # part of the information that may be noise; a bound from what is left of more would be noise itself
+_MOST_DRAWN, _OCTAVES = 1 << 19, 8  # counts that are drawn at a time, for 1 to 4^7 times the pulses
+_MEAN_OF_90 = 0.657  # mean of the smallest 90 % of the moduli of normal errors, over their standard deviation
 RUNS = 8  # of a quarter of the photons each two, whose scatter tells the noise of all
 
 
@@ -68,6 +70,9 @@ class Pilot:
     level: float  # of background per σ under it
     light_noise: float  # relative standard error of the target's light in a pixel
     photons: int  # of all runs
+    excess: tuple[tuple[float, float], ...] = ()
+    """Pulses, and noise of the planned estimator over the Cramér–Rao bound, ≥ 1; empty for likelihood, which counts as
+    one that reaches it."""
 
 
 def window(scene: Scene, device: str | None = None) -> Scene:
@@ -146,12 +151,14 @@ def measure(
     *,
     even: bool = False,
     channel: Channel = "I",
+    method: Method = "likelihood",
+    depth_error: float = 0.01,
 ) -> Pilot:
     """Numbers of `scene`, whose laser's energy and detector may differ from those of the runs, in a channel of an
     analyser; `typical`: the runs' `typical_pixels`.
 
     `even`: the target is the same for all pixels, so that their median error has no noise of the runs; `floor` is then
-    its modulus.
+    its modulus. `method`: of `excess`, for pulses from those on whose bound is a depth error [m].
     """
     # The traced scene with what a detector sees of the wanted one.
     laser = {name: getattr(scene.laser, name) for name in ("pulse_energy", "repetition_rate", "pulse_fwhm_ps")}
@@ -182,7 +189,8 @@ def measure(
 
     def errors(frames: Frames, histogram: Any) -> dict[str, Any]:
         """Depth by each estimator, from a histogram without noise, less the true depth [m]."""
-        return {method: _depth_error(both, frames, histogram, method, device) for method in METHODS}
+        times = {method: _time(frames, histogram, frames.background, method, device) for method in METHODS}
+        return {name: depth_from_time(time, scene=both.scene) - both.truth.depth for name, time in times.items()}
 
     error, unscattered = errors(frames, light), errors(clear_frames, clear_frames.expected.astype(np.float64))
     bias = {method: median(values) for method, values in error.items()}
@@ -192,43 +200,50 @@ def measure(
         piled = {method: median(recorded[method] - error[method]) for method in METHODS}
     scale = both.scene.laser.photons_per_pulse * scene.detections_per_photon
     pool = _Pool(both, typical)
-    returned = pool(signal)
-    peak, level = _return(returned, pool(background), both.scene)
+    returned, constant = pool(signal), pool(background)
+    peak, level = _return(returned, constant, both.scene)
     bound, shot, information_noise = _bounds(both, (first, second), pool, device)
+    excess: Any = ()
+    if method != "likelihood" and bound < math.inf:
+        first_pulses = max((bound / depth_error) ** 2, 1.0)
+        excess = _excess(frames, returned + constant, constant, method, bound / pool.slope, first_pulses, device)
     lights = [run.tallies[:2].sum(axis=(0, 3), dtype=np.float64)[seen] for run in (first, second)]
     return Pilot(
-        pixels=int(seen.sum()),
-        unscattered=float(both.component("ballistic")[typical].sum(axis=-1).mean() * scale),
-        target=float(returned.sum()),
-        backscatter=float(_background(both)[typical].sum(axis=-1).mean() * scale),
+        pixels=int(seen.sum()), unscattered=float(both.component("ballistic")[typical].sum(axis=-1).mean() * scale),
+        target=float(returned.sum()), backscatter=float(_background(both)[typical].sum(axis=-1).mean() * scale),
         noise=float(np.median(noise_rate(both.scene, both.truth))) * (scene.gate.stop - scene.gate.start),
-        brightest=_brightest(*(run.detections.sum(axis=-1, dtype=np.float64) for run in (first, second))),
-        bound=bound,
-        shot_noise=shot,
-        information_noise=information_noise,
-        floor={name: abs(bias[name]) if even else median(np.abs(values)) for name, values in error.items()},
-        bias=bias,
-        unscattered_floor={name: median(np.abs(values)) for name, values in unscattered.items()},
-        pile_up=piled,
-        peak=float(peak),
-        level=float(level),
+        brightest=_brightest(*(run.detections.sum(axis=-1, dtype=np.float64) for run in (first, second))), bound=bound,
+        shot_noise=shot, information_noise=information_noise,
+        floor={name: abs(bias[name]) if even else median(np.abs(values)) for name, values in error.items()}, bias=bias,
+        unscattered_floor={name: median(np.abs(values)) for name, values in unscattered.items()}, pile_up=piled,
+        peak=float(peak), level=float(level),
         light_noise=math.sqrt(np.mean(np.square(lights[0] - lights[1]))) / max(float(np.mean(sum(lights))), 1e-300),
-        photons=both.photons,
-    )
+        photons=both.photons, excess=excess,
+    )  # fmt: skip
 
 
-def _depth_error(result: Result, frames: Frames, histogram: Any, method: Any, device: str | None) -> Floats:
-    """Depth by an estimator that knows the background, less the true depth [m]."""
-    time = arrival_time(
-        histogram,
-        gate_start=frames.gate_start,
-        bin_width=frames.bin_width,
-        method=method,
-        irf=frames.irf,
-        background=frames.background,
-        device=device,
-    )
-    return depth_from_time(time, scene=result.scene) - result.truth.depth
+def _time(frames: Frames, histogram: Any, background: Any, method: Method, device: str | None) -> Floats:
+    """Arrival time by an estimator that knows the background [s]."""
+    axis: Any = {"gate_start": frames.gate_start, "bin_width": frames.bin_width, "irf": frames.irf}
+    return arrival_time(histogram, method=method, background=background, device=device, **axis)
+
+
+def _excess(
+    frames: Frames, light: Floats, background: Floats, method: Method, bound: float, first: float, device: str | None
+) -> tuple[tuple[float, float], ...]:
+    """See `Pilot`: arrival times of counts that are drawn from `light` [T] against that of `light` itself; `bound` for
+    one pulse [s]. The largest tenth of the errors, false peaks, are left out."""
+    drawn, random, found = int(np.clip(_MOST_DRAWN // len(light), 16, 512)), np.random.default_rng(0), []
+    if frames.detector.mode == "first_photon":
+        light = first_photon_probabilities(light[None, None], device=device)[0, 0]
+    for pulses in first * 4.0 ** np.arange(_OCTAVES):
+        expected = np.tile(pulses * light, (drawn, 1))
+        counts = np.concatenate([expected[:1], random.poisson(expected)])
+        times = _time(frames, counts, pulses * background, method, device)
+        off = np.sort(np.nan_to_num(np.abs(times[1:] - times[0]), nan=math.inf))[: round(0.9 * drawn)]
+        excess = float(off.mean()) / _MEAN_OF_90 * math.sqrt(pulses) / bound
+        found.append((float(pulses), min(max(excess, 1.0), 1e6)))
+    return tuple(found)
 
 
 def _brightest(first: Floats, second: Floats) -> float:
@@ -269,6 +284,8 @@ class _Pool:
 
     def __init__(self, result: Result, typical: Mask) -> None:
         self.typical = typical
+        slope = depth_per_time(result.scene, np.nan_to_num(result.truth.range.astype(np.float64)))
+        self.slope = float(slope[typical].mean())  # of depth over time [m/s]
         path = result.true_path()[typical] / (result.scene.medium.pulse_speed * result.scene.gate.bin_width)
         shift = np.rint(path - np.median(path)).astype(np.int64)[:, None]
         self.bins = np.arange(result.scene.gate.bins) + shift
@@ -298,7 +315,6 @@ def _bounds(result: Result, runs: tuple[Result, Result], pool: _Pool, device: st
         "device": device,
     }
     law: Any = "first_photon" if scene.detector.mode == "first_photon" else "poisson"
-    slope = depth_per_time(scene, np.nan_to_num(result.truth.range.astype(np.float64)))[pool.typical].mean()
 
     def bound(background: Any, law: Any) -> tuple[float, float]:
         information, noise = (float(x) for x in information_from_histogram(signal, background, law=law, **options))
@@ -306,7 +322,7 @@ def _bounds(result: Result, runs: tuple[Result, Result], pool: _Pool, device: st
             return math.inf, 1.0
         part = noise / information
         left = information - noise if part < _MOST_NOISE else 0.0
-        return float(slope) / math.sqrt(left) if left > 0.0 else math.inf, part
+        return pool.slope / math.sqrt(left) if left > 0.0 else math.inf, part
 
     recorded, part = bound(pool(light), law)
     return recorded, bound(0.0, "poisson")[0], part

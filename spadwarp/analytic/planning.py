@@ -90,7 +90,7 @@ class Proposal:
     scene: Scene  # the scene with the proposed gate, pulses, repetition rate and pulse energy, ready to simulate
     depth_error: float  # asked for [m]
     time: float  # longest for a depth frame [s]
-    method: str  # estimator whose floor counts
+    method: str  # estimator whose noise and floor count
     target_range: tuple[float, float]  # least and largest range of the target [m]
     optical_depth: float  # of the water before the nearest of it, one way, along the axis
     gate_range: tuple[float, float]  # ranges at the ends of the gate, laser at the lens and behind its port [m]
@@ -123,6 +123,13 @@ class Proposal:
     def judged(self) -> bool:
         """Whether the traced photons tell; if not, pulses, terms and limit are those of a run of noise."""
         return self.pulses_for != "not judged"
+
+    @property
+    def more_photons(self) -> str:
+        """How many would judge, in words."""
+        if math.isfinite(self.photons_needed):
+            return f"about {self.photons_needed:.1e} photons would do, {with_prefix(self.seconds_needed, 's')} here"
+        return f"more than {1e4 * self.pilot.photons:.0e} would be needed: the answer lies between two"
 
     def __repr__(self) -> str:
         if not self.judged:
@@ -175,7 +182,7 @@ def plan(
         ranges: Least and largest range where the target may be [m]; default: that of the scene's targets. If given, the
             target is a plane at the largest, with the reflectance of the scene's first target, else 0.5.
         margin: Range of water that the gate holds before and behind the target [m].
-        method: Estimator whose floor counts.
+        method: Estimator whose noise and floor count.
         full_power: Take the largest pulse energy within the limits, not only the scene's if it is within them.
         eye_distance: An eye at this distance from the laser limits the pulse energy [m]; default: reported for 0.1 m,
             and no limit.
@@ -197,17 +204,12 @@ def plan(
     check_choice("channel", channel, CHANNELS)
     planner = _Planner(
         depth_error=read_real("depth_error", depth_error, "[1e-9, 1e9] m"),
-        time=read_real("time", time, "[1e-9, 1e9] s"),
-        margin=read_real("margin", margin, "[0, 1e6] m"),
-        method=method,
+        time=read_real("time", time, "[1e-9, 1e9] s"), margin=read_real("margin", margin, "[0, 1e6] m"), method=method,
         full_power=full_power,
         eye_distance=None if eye_distance is None else read_real("eye_distance", eye_distance, "[0, 1e9] m"),
-        eye_exposure=read_real("eye_exposure", eye_exposure, "[1e-6, 3e4] s"),
-        seed=check_integer("seed", seed, SEED),
-        device=device,
-        channel=channel,
-        progress=progress,
-    )
+        eye_exposure=read_real("eye_exposure", eye_exposure, "[1e-6, 3e4] s"), seed=check_integer("seed", seed, SEED),
+        device=device, channel=channel, progress=progress,
+    )  # fmt: skip
     problem = ""
     if channel != "I" and not (scene.camera.channels if channel in POLARISED else channel in scene.tallied_channels):
         problem = f"channel = {channel!r} needs camera.polarisation = 'analyser' or 'stokes', or medium.inelastic"
@@ -328,7 +330,7 @@ class _Planner:
             elapsed = sum(run.timing.get("trace", 0.0) for run in runs)  # not what compiles, or judges
             last = photons is not None or traced > _MOST
             try:
-                scene, energy_limit, piled, eye, pilot = self._settle(asked, runs, typical, even)
+                scene, energy_limit, piled, pilot = self._settle(asked, runs, typical, even)
                 parts = [self._settle(asked, runs[i : i + 2], typical, even)[-1] for i in range(0, RUNS, 2)]
                 # Noise of the runs moves a median of moduli away from 0, in quarters of the photons about twice as far.
                 twice = {key: float(np.mean([one.floor[key] for one in parts])) for key in pilot.floor}
@@ -358,48 +360,39 @@ class _Planner:
         fluence = axis_fluence(scene, span[0]) * math.exp(-optical_depth)
         index, advance = scene.medium.group_index, port_advance(scene)
         return Proposal(
-            scene=scene,
-            depth_error=self.depth_error,
-            time=self.time,
-            method=self.method,
-            target_range=span,
+            scene=scene, depth_error=self.depth_error, time=self.time, method=self.method, target_range=span,
             optical_depth=optical_depth,
             gate_range=tuple(range_from_time(end, index) + advance for end in (scene.gate.start, scene.gate.stop)),
-            unambiguous_range=range_from_time(1.0 / rate, index) + advance,
-            largest_rate=largest_rate,
-            pile_up_energy=piled,
-            eye=eye,
-            energy_limit=energy_limit,
-            irradiance=fluence * scene.laser.pulse_energy * scene.laser.repetition_rate,
-            pulses=pulses,
+            unambiguous_range=range_from_time(1.0 / rate, index) + advance, largest_rate=largest_rate,
+            pile_up_energy=piled, eye=self._eye(scene), energy_limit=energy_limit,
+            irradiance=fluence * scene.laser.pulse_energy * scene.laser.repetition_rate, pulses=pulses,
             pulses_for=purpose,
             pulses_range=(min(ends[0].pulses, ends[2].pulses), max(ends[0].pulses, ends[2].pulses)),
-            frame_time=frame_time,
-            reached=None if factor > 1.0 else purpose in _ENOUGH and frame_time <= self.time,
-            terms=terms,
-            limit=" or ".join(limits),
+            frame_time=frame_time, reached=None if factor > 1.0 else purpose in _ENOUGH and frame_time <= self.time,
+            terms=terms, limit=" or ".join(limits),
             advice=self._advice(ends[1]._replace(purpose=purpose, time=frame_time), pilot.floor, rate, largest_rate),
-            pilot=pilot,
-            photons_needed=traced * factor,
+            pilot=pilot, photons_needed=traced * factor,
             seconds_needed=sum(run.timing.get("trace", math.nan) for run in runs) * factor,
-        )
+        )  # fmt: skip
 
     def _settle(
         self, scene: Scene, runs: Sequence[Result], typical: Mask, even: bool
-    ) -> tuple[Scene, str, float, EyeLimit, Pilot]:
-        """The scene with its pulse energy, what sets it, that of pile-up, the limit for the eye; and what an even
-        number of runs measured."""
-        options: dict[str, Any] = {"even": even, "channel": self.channel}
+    ) -> tuple[Scene, str, float, Pilot]:
+        """The scene with its pulse energy, what sets it, that of pile-up; and what an even number of runs measured."""
+        options: dict[str, Any] = {"even": even, "channel": self.channel, "depth_error": self.depth_error}
+        options["method"] = self.method if len(runs) == RUNS else "likelihood"  # parts have the noise of all
         found = measure(runs, scene, typical, self.device, **options)
-        eye = eye_limit(scene, distance=self.eye_distance or 0.1, exposure=self.eye_exposure)
         piled = scene.laser.pulse_energy * max(PILE_UP - found.noise, 0.0) / found.brightest
-        allowed = {"pile-up": piled} | ({} if self.eye_distance is None else {"eye": eye.pulse_energy})
+        allowed = {"pile-up": piled} | ({} if self.eye_distance is None else {"eye": self._eye(scene).pulse_energy})
         energy_limit = min(allowed, key=allowed.__getitem__)
         lowest = allowed[energy_limit]
         if not (lowest > 0 and ((self.full_power and not even) or scene.laser.pulse_energy > lowest)):
-            return scene, "", piled, eye, found
+            return scene, "", piled, found
         scene = scene.with_overrides(laser={"pulse_energy": _rounded_down(lowest)})
-        return scene, energy_limit, piled, eye, measure(runs, scene, typical, self.device, **options)
+        return scene, energy_limit, piled, measure(runs, scene, typical, self.device, **options)
+
+    def _eye(self, scene: Scene) -> EyeLimit:
+        return eye_limit(scene, distance=self.eye_distance or 0.1, exposure=self.eye_exposure)
 
     def _outcome(self, scene: Scene, pilot: Pilot) -> _Outcome:
         pulses, purpose = self._pulses(scene, pilot)
@@ -427,7 +420,11 @@ class _Planner:
         fixed = math.hypot(pilot.floor[self.method], pilot.pile_up[self.method])
         left = math.sqrt(max(self.depth_error**2 - fixed**2, 0.0))
         purpose = "depth error" if left > 0 else "floor"
-        wanted = (pilot.bound / (left or fixed / 3.0)) ** 2
+        noise = left or fixed / 3.0
+        wanted = (pilot.bound / noise) ** 2
+        if pilot.excess:
+            tried = max(wanted, 1.0) * np.geomspace(1.0, 1e9, 1200)
+            wanted = min(tried[_noise(pilot, tried) <= noise], default=math.inf)
         peaks = _pulses_without_false_peaks(scene, pilot, self.device)
         if peaks > wanted:
             wanted, purpose = peaks, "false peaks" if left > 0 else "floor"
@@ -440,8 +437,12 @@ class _Planner:
         """What would help: time, where the pulses reach the depth error but take too long."""
         _, purpose, _, limit, frame_time = found
         advice, best = _ADVICE[limit], min(floor, key=floor.__getitem__)
+        if limit == "estimator" and floor["likelihood"] < self.depth_error:
+            advice += f", or --method likelihood, which reaches the bound and leaves {1e3 * floor['likelihood']:.3g} mm"
         if limit == "forward scattering" and floor[best] < 0.7 * floor[self.method]:
-            advice += f", or --method {best}, whose floor is {with_prefix(floor[best], 'm')}, at more noise"
+            advice += (
+                f", or --method {best}, whose floor is {with_prefix(floor[best], 'm')}: plan with it, for its noise"
+            )
         if purpose not in ("depth error", "false peaks"):
             return advice + ("; more pulses do not help" if limit == "forward scattering" else "")
         if frame_time <= self.time:
@@ -496,7 +497,9 @@ class _Planner:
         would = _SHARE * needed.get(unjudged[0], math.inf)
         told = f"about {would:.1e} photons would tell" if would < math.inf else "more photons would tell"
         beyond = f"; from {far:.3g} m on it is not reached: {limit}" if far < math.inf else ""
-        return near or math.nan, f"not judged from {unjudged[0]:.3g} to {unjudged[1]:.3g} m: {told}{beyond}", unjudged
+        ends = list(dict.fromkeys(f"{one:.3g}" for one in unjudged))
+        where = f"{'from' if ends[1:] else 'at'} {' to '.join(ends)} m"
+        return near or math.nan, f"not judged {where}: {told}{beyond}", unjudged
 
 
 def bracket(judge: Callable[[float], bool | None], start: float) -> tuple[float, float, tuple[float, float] | None]:
@@ -631,23 +634,32 @@ def _pulses_without_false_peaks(scene: Scene, pilot: Pilot, device: str | None) 
     return float(pulses[few[0]]) if few.size else math.inf
 
 
+def _noise(pilot: Pilot, pulses: Any) -> Any:
+    """Noise of the estimator [m]."""
+    excess = np.interp(np.log(pulses), *np.log(pilot.excess).T) if pilot.excess else 0.0
+    return pilot.bound / np.sqrt(pulses) * np.exp(excess)
+
+
 def _terms(pilot: Pilot, pulses: int, method: str) -> dict[str, float]:
     """Parts of the depth error [m]; squares add up."""
+    noise = float(_noise(pilot, pulses))
     bound, shot = pilot.bound / math.sqrt(pulses), pilot.shot_noise / math.sqrt(pulses)
     floor, piled = pilot.floor[method], abs(pilot.pile_up[method])
     return {
         "shot noise": min(shot, bound),
         "background": math.sqrt(max(bound**2 - shot**2, 0.0)),
         "Cramér–Rao bound": bound,
+        "estimator": math.sqrt(max(noise**2 - bound**2, 0.0)),
         "forward scattering": floor,
         "pile-up": piled,
-        "total": math.hypot(bound, floor, piled),
+        "total": math.hypot(noise, floor, piled),
     }
 
 
 def _limit(scene: Scene, pilot: Pilot, terms: dict[str, float], pulses: int, method: str) -> str:
     """What the depth error is made of for the most part."""
-    largest = max(("shot noise", "background", "forward scattering", "pile-up"), key=terms.__getitem__)
+    parts = "shot noise", "background", "estimator", "forward scattering", "pile-up"
+    largest = max(parts, key=terms.__getitem__)
     if largest == "background":
         return "backscatter" if pilot.backscatter >= pilot.noise else "dark counts and ambient light"
     if largest == "forward scattering" and 0.5 * pilot.floor[method] < pilot.unscattered_floor[method] < math.inf:
@@ -674,6 +686,7 @@ _ADVICE = {
     "bin width": "narrower bins, gate.bin_width_ps: where light is within a bin is not known",
     "backscatter": "a gate that begins closer to the target, more distance between laser and lens, a narrower view",
     "dark counts and ambient light": "a shorter gate, a narrower spectral filter, a cooler or quieter detector",
+    "estimator": "more pulses",
     "forward scattering": "a shorter distance, clearer water, a narrower beam or view",
     "pixel size": "smaller pixels: slopes and edges of the target within one pixel, also without scattered light",
     "pile-up": "less pulse energy, or Coates' correction (`spadwarp detect --coates`)",

@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 
 from spadwarp.analytic.budgets import LONGEST, BudgetRow, central_row
 from spadwarp.analytic.planning import plan
+from spadwarp.frames.depth import Method
 from spadwarp.io.text import parse_toml
 from spadwarp.result import POLARISED
 from spadwarp.scene import Scene, SceneLike, as_scene, parse_override
@@ -27,7 +28,9 @@ from spadwarp.values import (
     check_integer,
     parse_number,
     quantity,
+    read_real,
     shown,
+    with_prefix,
 )
 
 __all__ = ["PlanRow", "Sweep", "combinations", "parse_values", "parse_vary", "sweep"]
@@ -57,6 +60,16 @@ class Sweep:
     fields: tuple[str, ...]
     values: tuple[tuple[Any, ...], ...]
     rows: tuple[BudgetRow, ...] | tuple[PlanRow, ...]
+    title: str  # scene, and what its numbers are of
+
+    @property
+    def unequal_energies(self) -> str:
+        """Words where the pulses of plans have different energies, else ""."""
+        found = {row.pulse_energy for row in self.rows if isinstance(row, PlanRow)}
+        if len(found) < 2 or "laser.pulse_energy" in self.fields:
+            return ""
+        least, most = (with_prefix(end, "J") for end in (min(found), max(found)))
+        return f"the pulses have different energies, {least} to {most}; laser.pulse_energy = '{least}' makes them equal"
 
     @property
     def is_flat(self) -> bool:
@@ -78,6 +91,7 @@ def sweep(
     of: Literal["budget", "plan"] = "budget",
     depth_error: float | str = 0.01,
     time: float | str = 1.0,
+    method: Method = "likelihood",
     photons: int | Literal["auto"] = "auto",
     seed: int = 0,
     largest_range: bool = True,
@@ -94,7 +108,7 @@ def sweep(
             "co" or "cross" to the laser's polarisation.
         of: `"budget"`: `BudgetRow` by the analytic model, at the range of the target pixel nearest to the optical axis.
             `"plan"`: `PlanRow`, by a Monte Carlo run for each combination.
-        depth_error, time, photons, seed, largest_range: Of a plan, as in `spadwarp.plan`.
+        depth_error, time, method, photons, seed, largest_range: Of a plan, as in `spadwarp.plan`.
         device: Warp device; default: the first GPU, else the CPU.
         progress: Called with (values of a combination, how many are done, how many there are).
 
@@ -113,9 +127,15 @@ def sweep(
         if not planned:
             rows.append(central_row(changed, device))
             continue
-        options: Any = {"depth_error": depth_error, "time": time, "photons": photons, "seed": seed} | arguments
-        rows.append(_plan_row(changed, {**options, "largest_range": largest_range, "device": device}))
-    curves = Sweep(fields=fields, values=tuple(values for values, *_ in chosen), rows=tuple(rows))
+        options: Any = {"depth_error": depth_error, "time": time, "method": method, "photons": photons, "seed": seed}
+        options |= arguments | {"largest_range": largest_range, "device": device}
+        rows.append(_plan_row(changed, options))
+    title, source = "unscattered light alone", as_scene(scene).source
+    if planned:
+        asked = with_prefix(read_real("depth_error", depth_error, "[1e-9, 1e9] m"), "m")
+        title = f"pulses for a depth error of {asked} by {method}"
+    title = f"{source.stem}: {title}" if source else title
+    curves = Sweep(fields=fields, values=tuple(values for values, *_ in chosen), rows=tuple(rows), title=title)
     if curves.is_flat:
         text = f"no number depends on {' and '.join(fields)}: the model does not use it, or another field has its place"
         warnings.warn(text, SpadwarpWarning, stacklevel=2)
@@ -133,7 +153,7 @@ def _plan_row(scene: Scene, options: dict[str, Any]) -> PlanRow:
         sigma_depth=told * found.pilot.bound / math.sqrt(scene.pulses_per_depth_frame),
         floor=told * math.hypot(found.pilot.floor[found.method], found.pilot.pile_up[found.method]),
         largest_range=found.largest_range if found.unjudged_ranges is None else math.nan,
-        limit=found.limit if found.judged else "not judged: more photons",
+        limit=found.limit if found.judged else f"not judged: {found.more_photons}",
     )  # fmt: skip
 
 
@@ -159,6 +179,8 @@ def combinations(scene: SceneLike, vary: Any, *, planned: bool) -> tuple[tuple[s
     if not planned and (own := [field for field in fields if field in ("range", _ANALYSER)]):
         text = "is no field of a budget: of = 'plan' varies it with others; `spadwarp.budget` is over range alone"
         raise ArgumentError(f"vary: {own[0]} {text}")
+    if planned and (own := [field for field in fields if field in ("gate.start_ns", "gate.bins")]):
+        raise ArgumentError(f"vary: {own[0]} is what a plan proposes: vary gate.bin_width_ps, or of = 'budget'")
     waves = dict(curves).get("laser.wavelength_nm", ())
     follows = scene.medium.chlorophyll is not None or any(field.startswith("medium.") for field in fields)
     if not follows and any(isinstance(wave, float | int) and abs(wave - 532.0) > 10.0 for wave in waves):
@@ -178,12 +200,10 @@ def combinations(scene: SceneLike, vary: Any, *, planned: bool) -> tuple[tuple[s
                 arguments["channel"] = "I" if word == "none" else word
                 if value != "none" and not scene.camera.channels:
                     overrides["camera.polarisation"] = "analyser"
-            elif field.endswith(".preset") and value == "none":
-                overrides[field.removesuffix(".preset")] = None
-                if field == "camera.port.preset" and scene.laser.port == "camera":  # the laser shines through it
-                    overrides["laser.port"] = None
             else:
                 overrides[field] = value
+                if (field, value) == ("camera.port.preset", "none") and scene.laser.port == "camera":
+                    overrides["laser.port"] = None  # which shines through it
         changed = scene.with_overrides(overrides)
         if arguments.get("channel", "I") != "I" and changed.laser.polarisation == "none":
             text = "is for polarised lasers: laser.polarisation = 'linear'"

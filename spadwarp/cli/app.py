@@ -5,7 +5,9 @@
 
 from __future__ import annotations
 
+import difflib
 import io
+import itertools
 import os
 import platform
 import shlex
@@ -19,7 +21,7 @@ from pathlib import Path
 from typing import Any, NoReturn, TypeVar
 
 import typer
-from typer.core import TyperGroup
+from typer.core import TyperCommand, TyperGroup
 
 import spadwarp
 from spadwarp.values import ArgumentError, ConfigError, SpadwarpError, SpadwarpWarning, UnforeseenArgument, in_words
@@ -53,6 +55,29 @@ STAGES = {
     "Datasets and training": ("dataset", "train", "evaluate"),
     "Trust and speed": ("validate", "bench"),
 }
+
+
+_UsageError: Any = typer.BadParameter.__base__  # of click, which newer versions of typer hold inside
+
+
+class Command(TyperCommand):
+    """An unknown option is said to be another command's, a value in two words to be one."""
+
+    def parse_args(self, ctx: Any, args: list[str]) -> list[str]:
+        words = list(args)
+        try:
+            return super().parse_args(ctx, args)
+        except _UsageError as error:
+            name, near = getattr(error, "option_name", None), getattr(error, "possibilities", None) or ()
+            if name is not None:
+                every = ctx.parent.command.commands if ctx.parent else {}
+                owners = [other for other, one in every.items() if any(name in option.opts for option in one.params)]
+                error.possibilities = [] if owners else difflib.get_close_matches(name, near, cutoff=0.75)
+                error.message += f"; {', '.join(owners[:4])} {'have' if owners[1:] else 'has'} it" if owners else ""
+            for number, unit in itertools.pairwise(words):
+                if number[-1:].isdigit() and unit.isalpha() and f"({unit})" in error.message:
+                    error.message += f"; write {number}{unit} as one word"
+            raise
 
 
 class _Commands(TyperGroup):

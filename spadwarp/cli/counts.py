@@ -83,7 +83,17 @@ def detect(
     for text in (*recording.file.notes, *_bound_noise(recording, result.photons)):
         complain(text, "note")
     files = [recording.file.path, spadwarp.viz.draw(recording.file, out / "frame.png", pixel=pixel)]
-    answer({**_recorded(recording, frames), "channel": channel, "files": files})
+    found = _recorded(recording, frames)
+    each, limit = found["detections_per_pulse_and_pixel"], spadwarp.analytic.PILE_UP
+    if (
+        each > limit
+        and scene.detector.mode == "first_photon"
+        and not coates
+        and recording.file.target_noise_ratio != math.inf
+    ):
+        text = f"pile-up: {each:.2g} detections per pulse and pixel, more than {limit:g}, shift depth towards the laser"
+        complain(f"{text}; less laser.pulse_energy, or --coates", "warning")
+    answer({**found, "channel": channel, "files": files})
 
 
 def _window(window: tuple[str, str]) -> tuple[float, int]:
@@ -111,10 +121,7 @@ def _recorded(recording: Recording, frames: int) -> dict[str, Any]:
     median = float(np.median(bound)) if bound.size else math.inf
     per_pixel = recording.detections / (frames * file.shape[1] * file.shape[2])
     return {
-        "pulses": file.pulses,
-        "frames": frames,
-        "seed": file.seed,
-        "detections_per_frame_and_pixel": per_pixel,
+        "pulses": file.pulses, "frames": frames, "seed": file.seed, "detections_per_frame_and_pixel": per_pixel,
         "detections_per_pulse_and_pixel": per_pixel / file.pulses,
         "bound": {
             "pixels": int(bound.size),
@@ -122,9 +129,9 @@ def _recorded(recording: Recording, frames: int) -> dict[str, Any]:
             "noise_fraction": noise if math.isfinite(noise) else None,
         },
         "depth": {name: dataclasses.asdict(error) for name, error in recording.errors.items()},
-        "noise_ratio": file.target_noise_ratio,
+        "noise_ratio": file.target_noise_ratio if math.isfinite(file.target_noise_ratio or 0.0) else None,
         "notes": list(file.notes),
-    }
+    }  # fmt: skip
 
 
 def _bound_noise(recording: Recording, photons: int) -> list[str]:

@@ -17,7 +17,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal, Union, get_args, get_
 import typer
 
 import spadwarp
-from spadwarp.cli.app import app, complain, running, wrong
+from spadwarp.cli.app import Command, app, complain, running, wrong
 from spadwarp.values import parse_number, quantity, shown, suggestion
 
 if TYPE_CHECKING:
@@ -67,7 +67,7 @@ def command(*, name: str | None = None, prints_result: bool = False) -> Callable
         run.__doc__ = text
         here = inspect.Parameter("context", inspect.Parameter.KEYWORD_ONLY, annotation=typer.Context)
         vars(run)["__signature__"] = inspect.Signature([here, *made])
-        app.command(name or function.__name__)(run)
+        app.command(name or function.__name__, cls=Command)(run)
         return function
 
     return register

@@ -196,7 +196,8 @@ def _check_apart(written: Iterable[tuple[str, Path]], inputs: Iterable[str | Pat
     taken: dict[Path, str] = {}
     for option, path in written:
         if place(path) in kept:
-            wrong(f"{path} is read by this command and would be replaced", option)
+            what = f"{path} is read by this command and would be replaced"
+            wrong(what if path.exists() else f"{path.parent} is read by this command; name another directory", option)
         if place(path) in taken:
             wrong(f"{path} is also written for {taken[place(path)]}", option)
         taken[place(path)] = option

@@ -117,37 +117,17 @@ def plan(
     for text in _warnings(read, but="targets" if range_ else ""):
         complain(text)
     found = spadwarp.plan(
-        read,
-        depth_error=depth_error,
-        time=time,
-        ranges=range_,
-        margin=margin,
-        method=method,
-        full_power=full_power,
-        eye_distance=eye_distance,
-        eye_exposure=eye_exposure,
-        photons="auto" if photons is None else photons,
-        seed=seed,
-        largest_range=not no_range,
-        channel=channel,
-        device=device,
-        progress=progress(),
-    )
+        read, depth_error=depth_error, time=time, ranges=range_, margin=margin, method=method, full_power=full_power,
+        eye_distance=eye_distance, eye_exposure=eye_exposure, photons="auto" if photons is None else photons,
+        seed=seed, largest_range=not no_range, channel=channel, device=device, progress=progress(),
+    )  # fmt: skip
     files = [] if write is None else [write]
     for file in files:
         made = f"# Proposed by `spadwarp plan {scene.name} --depth-error {depth_error:g}`: {_verdict(found)}\n\n"
         spadwarp.io.write_text(made + found.scene.to_toml(folder=file.parent), file)
     say(_verdict(found))
-    hidden = [
-        "pilot",
-        "terms",
-        "advice",
-        "limit",
-        "pulses_range",
-        "unjudged_ranges",
-        "photons_needed",
-        "seconds_needed",
-    ]
+    hidden = ["pilot", "terms", "advice", "limit", "largest_range", "range_limit", "pulses_range", "unjudged_ranges"]
+    hidden += ["photons_needed", "seconds_needed"]
     hidden += [] if found.judged else ["pulses", "pulses_for", "frame_time", "reached", "pile_up_energy"]
     told = {name: value for name, value in found.to_dict().items() if value == value and value != ""}
     values = {name: value for name, value in told.items() if name not in hidden}
@@ -157,7 +137,11 @@ def plan(
     say(readable(values))
     if found.range_limit:
         farthest = f"{found.largest_range:.3g} m; " if found.largest_range == found.largest_range else ""
-        say(f"largest range, for a plane square to the optical axis: {farthest}{found.range_limit}")
+        shorter = found.reached and not found.unjudged_ranges and found.largest_range < found.target_range[0]
+        full = (
+            "; nearer than the target: a plane that fills the view scatters more light into a pixel" if shorter else ""
+        )
+        say(f"largest range, for a plane square to the optical axis: {farthest}{found.range_limit}{full}")
     if found.judged:
         say(rows(_terms(found)))
         say(f"What would help: {found.advice}.")
@@ -170,11 +154,8 @@ def _verdict(found: Proposal) -> str:
     """One sentence."""
     asked, total = with_prefix(found.depth_error, "m"), with_prefix(found.terms["total"], "m")
     if not found.judged:
-        traced, needed = found.pilot.photons, found.photons_needed
-        would = f"about {needed:.1e} would do, {with_prefix(found.seconds_needed, 's')} here"
-        if not math.isfinite(needed):
-            would = f"more than {1e4 * traced:.0e} would be needed: the answer lies between two"
-        return f"A depth error of {asked}: not enough photons to judge, {traced:.1e} were traced; {would}."
+        traced = found.pilot.photons
+        return f"A depth error of {asked}: not enough photons to judge, {traced:.1e} were traced; {found.more_photons}."
     if found.pulses_for == "out of reach":
         return f"A depth error of {asked} is out of reach: 2^31 pulses are too few; limit: {found.limit}."
     least, most = found.pulses_range
@@ -200,10 +181,12 @@ def _terms(found: Proposal) -> dict[str, str]:
         "shot noise": "falls with the root of the pulses",
         "background": "backscatter, dark counts, ambient light; falls likewise",
         "Cramér–Rao bound": "both together: the least error of an unbiased estimator",
+        "estimator": f"noise of {found.method} beyond the bound",
         "forward scattering": f"{found.method}; does not fall with the pulses; {floors}; from {count(pilot.photons)} "
         f"traced photons; {unscattered}",
         "pile-up": "change of the median depth",
-        "total": "root of the sum of squares",
+        "total": "root of the sum of squares, near the axis; the median error that `spadwarp detect` reports is of the "
+        "whole frame and may be less or more",
     }
     title = f"depth error, {count(found.pulses)} pulses"
     return {title: "mm"} | {name: f"{short(1000 * value):<6}  {about[name]}" for name, value in found.terms.items()}
@@ -219,6 +202,7 @@ def sweep(
     of: Literal["budget", "plan"] | None = None,
     depth_error: opt.Length = 0.01,
     time: opt.Seconds = 1.0,
+    method: opt.Method = "likelihood",
     photons: int | None = None,
     seed: int = 0,
     no_range: bool = False,
@@ -241,6 +225,7 @@ def sweep(
         of: By default a budget; a plan where several fields vary, or with an option of plans.
         depth_error (LENGTH): Of a plan, asked for [m].
         time (TIME): Of a plan, the longest for a depth frame [s].
+        method: Of a plan, the estimator whose error counts.
         photons: Of a plan, for each combination. By default as many as judge, or 60 s.
         no_range: Of a plan: do not look for the largest range.
         out (DIR): Directory for sweep.png and sweep.csv; with a budget over range, budget.png and budget.csv.
@@ -252,7 +237,7 @@ def sweep(
           --vary laser.wavelength_nm=480,532 --vary camera.analyser=none,cross --out sweep/
     """
     read, texts = opt.read_scene(scene, overrides), vary or ["range="]
-    of_plans = "--depth-error", "--time", "--photons", "--seed", "--no-range"
+    of_plans = "--depth-error", "--time", "--method", "--photons", "--seed", "--no-range"
     asked = any(option in running.given for option in of_plans)
     of = of or ("plan" if asked or len(texts) > 1 or texts[0].strip().startswith("camera.analyser") else "budget")
     of_range = of == "budget" and len(texts) == 1 and texts[0].partition("=")[0].strip() == "range"
@@ -278,9 +263,9 @@ def sweep(
         once = [one for k, one in enumerate(once) if one not in once[:k]]
         for text in dict.fromkeys(text for changed in once for text in _warnings(changed)):
             complain(text)
-        planned: dict[str, Any] = {"depth_error": depth_error, "time": time, "photons": photons or "auto", "seed": seed}
+        planned: dict[str, Any] = {"depth_error": depth_error, "time": time, "method": method, "seed": seed}
         show = None if of == "budget" else lambda name, done, all: note(f"{name} ({done + 1} of {all})")
-        planned |= {"largest_range": not no_range, "progress": show}
+        planned |= {"photons": photons or "auto", "largest_range": not no_range, "progress": show}
         found = spadwarp.sweep(read, vary=texts, of=of, device=device, **planned)
         lines, draw = found.rows, spadwarp.viz.draw_sweep
         keys = [dict(zip(found.fields, value, strict=True)) for value in found.values]
@@ -299,10 +284,11 @@ def sweep(
         )
     else:
         cells = partial(_plan_cells, pulses=read.pulses_per_depth_frame)
-        say(f"of all light, by `spadwarp plan`; pulses for a depth error of {1e3 * depth_error:.3g} mm")
-    show_table(
-        ({**key, **cells(row)} for key, row in zip(keys, lines, strict=True)), keys=len(keys[0]) + (of == "budget")
-    )
+        say(f"of all light, by `spadwarp plan`; {found.title}")
+    table = [{**key, **cells(row)} for key, row in zip(keys, lines, strict=True)]
+    show_table(table, keys=len(keys[0]) + (of == "budget"))
+    if of == "plan" and found.unequal_energies:
+        say(found.unequal_energies)
     if of == "budget" and any(row.gate_moved for row in lines):
         say(
             f"* not the scene's gate, {read.gate.start_ns:.4g}-{read.gate.stop * 1e9:.4g} ns, which misses the return "
@@ -325,19 +311,14 @@ def _budget_cells(row: BudgetRow) -> dict[str, Any]:
         return count(float(f"{value:.3g}")) if 100.0 <= value < 1e7 else short(value)
 
     return {
-        "range [m]": f"{row.range:.4g}",
-        "optical depth": row.optical_depth,
+        "range [m]": f"{row.range:.4g}", "optical depth": row.optical_depth,
         "gate [ns]": f"{1e9 * row.gate_start:.4g}-{1e9 * row.gate_stop:.4g}{'*' if row.gate_moved else ' '}",
-        "pulses": pulses(row.pulses),
-        "signal": row.signal,
-        "background": row.background,
-        "α": row.alpha,
-        "signal/backscatter": row.signal_to_backscatter,
-        "σ* [ps]": sigma(1e12 * row.sigma_time),
+        "pulses": pulses(row.pulses), "signal": row.signal, "background": row.background, "α": row.alpha,
+        "signal/backscatter": row.signal_to_backscatter, "σ* [ps]": sigma(1e12 * row.sigma_time),
         "σ* [mm]": sigma(1e3 * row.sigma_depth),
         "outliers": "-" if math.isnan(share) else "< 0.001 %" if 0 < share < 1e-5 else f"{100 * share:.3g} %",
         "for 1 cm": "never" if math.isinf(row.pulses_for_1cm) else pulses(row.pulses_for_1cm),
-    }
+    }  # fmt: skip
 
 
 def _plan_cells(row: PlanRow, pulses: int) -> dict[str, Any]:
@@ -346,8 +327,8 @@ def _plan_cells(row: PlanRow, pulses: int) -> dict[str, Any]:
 
     return {
         "pulses": text(row.pulses),
-        "from": text(row.pulses_least),
-        "to": text(row.pulses_most),
+        "from": "-" if math.isnan(row.pulses) else text(row.pulses_least),
+        "to": "-" if math.isnan(row.pulses) else text(row.pulses_most),
         "time": with_prefix(row.frame_time, "s") if math.isfinite(row.frame_time) else "-",
         "pulse energy": with_prefix(row.pulse_energy, "J"),
         f"bound [mm] of {count(pulses)} pulses": 1e3 * row.sigma_depth,

@@ -64,20 +64,11 @@ def analyser_channel(result: Result, channel: Channel) -> Result:
     cube = cubes_of(result, "channels").get(channel)
     moments = None if cube is None or cube.second_moment is None else cube.second_moment.copy()
     return replace(
-        result,
-        scene=_behind_analyser(result.scene) if of_polarisation else lines_left_out,
-        tallies=tallies,
-        unit=unit,
-        half=None,
-        second_moment=moments,
-        batch_size=0 if moments is None else result.batch_size,
-        batches=0 if moments is None else result.batches,
-        batch_moments={},
-        reconstruction=None,
-        channel_tallies=None,
-        derivative_tallies=None,
-        provenance={**result.provenance, "channel": channel},
-    )
+        result, scene=_behind_analyser(result.scene) if of_polarisation else lines_left_out, tallies=tallies, unit=unit,
+        half=None, second_moment=moments, batch_size=0 if moments is None else result.batch_size,
+        batches=0 if moments is None else result.batches, batch_moments={}, reconstruction=None, channel_tallies=None,
+        derivative_tallies=None, provenance={**result.provenance, "channel": channel},
+    )  # fmt: skip
 
 
 def pixel_channel(result: Result, channel: Channel, row: int, column: int) -> Floats:
@@ -159,6 +150,10 @@ def noise_problem(result: Result) -> str:
     if ratio <= NOISE_GOAL:
         return ""
     if ratio == math.inf:
+        seen = float(np.median(result.detections.sum(axis=2))) if result.scene.detector.mode == "first_photon" else 0.0
+        if seen > 0.0:
+            text = "the first of them alone is recorded, and the target's are lost: less laser.pulse_energy"
+            return f"pile-up: {seen:.2g} photons of a pulse would be detected in the median pixel; {text}"
         return f"not enough photons: none of {result.photons:.3g} brought light back"
     photons, seconds = photons_needed(result)
     time = f", {duration(seconds)} here" if math.isfinite(seconds) else ""
@@ -173,6 +168,8 @@ def noise_caption(ratio: float | None) -> str:
     """For the caption of a picture of frames that show the noise of the simulation; else empty."""
     if ratio is None or ratio <= NOISE_GOAL:
         return ""
+    if ratio == math.inf:
+        return "; no light of the target is left"
     times = f"{ratio:.2g}" if ratio < 100.0 else count(float(f"{ratio:.2g}"))
     return f"; too few photons traced: noise of the simulation is {times} times the variance of the photons"
 

@@ -38,7 +38,9 @@ def window_indices(material: str, wavelength_nm: float) -> tuple[float, float]:
     low, high = glass["range"]
     if not low <= micrometres <= high:
         known = f"[{1e3 * low:g}, {1e3 * high:g}] nm"
-        raise ValueError(f"material = {material!r} is known for {known}, not for {wavelength_nm:g} nm")
+        raise ValueError(
+            f"material = {material!r} is known for {known}, not for laser.wavelength_nm = {wavelength_nm:g}"
+        )
     square, terms = micrometres**2, list(zip(glass["b"], glass["c"], strict=True))
     index = math.sqrt(1.0 + sum(b * square / (square - c) for b, c in terms))
     slope = -sum(b * c * micrometres / (square - c) ** 2 for b, c in terms) / index

@@ -163,7 +163,9 @@ class Scene(Shown, Document):
         """Why light cannot pass the ports, or cannot be computed through them."""
         camera, laser = self.camera.port, self.laser.port
         if laser == "camera" and camera is None:
-            yield "laser.port = 'camera' needs a camera.port"
+            yield "laser.port = 'camera' needs a camera.port, such as camera.port.preset = 'flat-glass'"
+        if camera is not None and camera.shape == "flat" and camera.axis[2] <= 0.0:
+            yield f"camera.port.normal = {list(camera.normal)} points away from the view, which is along +z"
         for section, port in (("camera", camera), ("laser", laser)):
             try:
                 _ = isinstance(port, Port) and port.indices(self.laser.wavelength_nm)

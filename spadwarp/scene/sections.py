@@ -334,7 +334,7 @@ def _over(model: type[Section] | None, old: Any, value: Any, name: str) -> Any:
         raise ConfigError(f"{name}[{min(value)}] does not exist: {name} = {shown(old)} is not a list")
     for index, item in sorted(value.items()):
         if index > len(items) - (model is None):
-            raise ConfigError(f"{name}[{index}] does not exist; {name} has {len(items)} values, from 0 on")
+            raise ConfigError(f"{name}[{index}] does not exist; {name} ends at {name}[{len(items) - 1}]")
         items[index : index + 1] = [_over(model, dict(enumerate(items)).get(index), item, f"{name}[{index}]")]
     return items
 
@@ -649,6 +649,8 @@ def _parse_value(value: str, text: str) -> Any:
         try:
             return parse_number(value)  # .9 and 5. are not TOML, but mean numbers
         except ValueError:
+            if re.fullmatch(r"[-+.\d]+(\s*,\s*[-+.\d]+)+", value):
+                raise ConfigError(f"override {shown(text)} is a list: write [{value}]") from None
             return value
     return table["value"] if len(table) == 1 else value
 
@@ -671,6 +673,7 @@ def _insert(model: type[BaseModel], layer: dict[Any, Any], key: Key, value: Any)
     whole, is_known, is_list = f"override {shown(key_text(key))}", True, False
     unfit = ConfigError(f"{whole} does not name a field; write section.field or targets[0].field")
     table: type[BaseModel] | None = model
+    key, value = (key[:-1], None) if key[1:] and (key[-1], value) == ("preset", "none") else (key, value)  # no port
     for part in key:
         if is_known and isinstance(part, int) == (table is not None and not is_list):
             raise unfit
@@ -763,6 +766,7 @@ def _line(key: Key, info: FieldInfo | None, problem: Any, model: type[BaseModel]
         word, siblings = str(key[-1]), list(model.model_fields)
         meant = _SYNONYMS.get(word)
         near = f"; did you mean {meant!r}?" if meant in siblings else suggestion(word, siblings)
+        near = "; it is pdp · fill_factor, which are fields" if word == "pde" and "pdp" in siblings else near
         homes = [home for home in whole.model_fields if word in getattr(table_of(whole, home), "model_fields", ())]
         homes = [] if isinstance(key[-2:][0], int) else homes  # an item of a list is not confused with a section
         hint = f"; did you mean {' or '.join(f'{home}.{word}' for home in homes[:2])}?" if homes else ""
@@ -797,6 +801,7 @@ def _line(key: Key, info: FieldInfo | None, problem: Any, model: type[BaseModel]
         return f"{entry} is not one of {listed}{suggestion(value, choices)}"
     if kind in _KINDS:
         values = f" of {size} values" if kind == "tuple_type" and size is not None else ""
+        values = f" in {interval_of(info)}" if kind.startswith("int_") and info is not None else values
         words = f" not {_KINDS[kind]}{values}"
         if choices:
             words = f" neither {' nor '.join([_KINDS[kind], *map(repr, choices)])}"

@@ -39,7 +39,8 @@ _OF_PLANS = ("pulses", "sigma_depth", "largest_range")
 def draw_budget(rows: Sequence[BudgetRow], path: str | Path | None = None, *, width: float = PAGE) -> Figure:
     """Signal, depth error, signal to backscatter, pulses for 1 cm over range, a line a water; see `draw_sweep`."""
     waters = tuple((row.range, f"{row.medium}, c = {row.extinction:.3g} 1/m") for row in rows)
-    return draw_sweep(Sweep(fields=("range", "water"), values=waters, rows=tuple(rows)), path, width=width)
+    curves = Sweep(fields=("range", "water"), values=waters, rows=tuple(rows), title="unscattered light alone")
+    return draw_sweep(curves, path, width=width)
 
 
 @paper()
@@ -57,6 +58,7 @@ def draw_sweep(curves: Sweep, path: str | Path | None = None, *, width: float = 
         # Where photons judge nothing, empty panels say so.
         names = [name for name in _OF_PLANS if not np.isnan(curves.column(name)).all()] or list(_OF_PLANS[:2])
     figure, axes = panel_grid(len(names), width, least=2.3, height=2.1, more=0.3)
+    figure.caption("; ".join(filter(None, (curves.title, curves.unequal_energies))))
     at, others = [value[0] for value in curves.values], [value[1:] for value in curves.values]
     ticks = list(dict.fromkeys(map(str, at)))
     numeric = all(isinstance(value, (int, float)) for value in at)
@@ -85,8 +87,8 @@ def draw_sweep(curves: Sweep, path: str | Path | None = None, *, width: float = 
             hollow = np.where(moved[own], shown, np.nan)
             axis.plot(place, hollow, "o", color=style_of["color"], markerfacecolor="white", markevery=every, zorder=3)
             for mark, cases in (("x", np.isinf(y[own])), ("$?$", unjudged[own])):
-                some, top = place[cases][::every], axis.get_xaxis_transform()
-                axis.scatter(some, np.full(len(some), 0.97), 25.0, style_of["color"], marker=mark, transform=top)
+                some, top, high = place[cases][::every], axis.get_xaxis_transform(), 0.97 - 0.06 * number
+                axis.scatter(some, np.full(len(some), high), 25.0, style_of["color"], marker=mark, transform=top)
         if name == "sigma_depth" and curves.fields == ("range", "water"):
             asked = f"depth error of {100 * TOLERANCE:g} cm"
             axis.axhline(TOLERANCE * 1e3, color="0.4", linewidth=0.8, linestyle=":", label=asked)
@@ -95,8 +97,8 @@ def draw_sweep(curves: Sweep, path: str | Path | None = None, *, width: float = 
         _value_axis(axis, np.array([y, *ends]))
         if numeric:  # also where there is nothing to show
             axis.update_datalim(np.column_stack([x, x]), updatey=False)
-        if np.isnan(y).all():
-            style.middle_text(axis, "not enough photons\nto judge")
+        if not np.isfinite(y).any():
+            style.middle_text(axis, "not enough photons\nto judge" if np.isnan(y).all() else "none is known")
             axis.tick_params(axis="y", which="both", left=False, labelleft=False)
         if not numeric:
             axis.set_xticks(range(len(ticks)), ticks, rotation=20, ha="right", rotation_mode="anchor")

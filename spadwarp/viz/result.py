@@ -165,10 +165,12 @@ def draw_spectrum(
 
 # A result
 
-_NOISY = "; hatched ({} % of the pixels): more noise of the simulation than of the photons"
-_HATCHED = (
-    "hatched, {} % of the pixels, the brightest bin not known to a third: noise of the simulation; more photons{} help"
-)
+_NOISY = "; {} of the pixels: more noise of the simulation than of the photons"
+_HATCHED = "{} of the pixels: the brightest bin not known to a third, noise of the simulation; more photons{} help"
+
+
+def _hatched(pixels: NDArray[np.bool_]) -> str:
+    return f"{'hatched, ' * bool(pixels.mean() < style.MOST_HATCHED)}{percent(pixels.mean())} %"
 
 
 def _typical_pixels(
@@ -206,7 +208,7 @@ def _result_figure(
     panels.figure.caption(_caption(result))
     if unclear.any() and kind != "truth":
         more = result.scene.has_straight_sight and result.reconstruction is None
-        panels.figure.note(_HATCHED.format(percent(unclear.mean()), " or a reconstruction" if more else ""))
+        panels.figure.note(_HATCHED.format(_hatched(unclear), " or a reconstruction" if more else ""))
     if kind == "intensity":
         panels.unclear = unclear
         per_pulse = result.scene.laser.photons_per_pulse * result.scene.detections_per_photon
@@ -533,7 +535,7 @@ def _frame_figure(
         depth, truth, bound = file.depth(method, number), file.truth_depth, file.bound_depth()
         if file.noise_ratio is not None:
             panels.unclear = noisy = file.noise_ratio > 1.0
-            hatched = _NOISY.format(percent(noisy.mean())) if noisy.any() else ""
+            hatched = _NOISY.format(_hatched(noisy)) if noisy.any() else ""
         panels.show_depth(depth, f"Depth ({method})", style.target_limits(truth, depth))
         panels.show_error(depth - truth, "Depth − truth")
         known = "" if np.isfinite(bound).any() else ": unknown"

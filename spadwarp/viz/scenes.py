@@ -20,6 +20,7 @@ from spadwarp.scene import Scene
 from spadwarp.scene.camera import to_camera, to_world
 from spadwarp.scene.medium import grid_cells
 from spadwarp.scene.pose import rotation_matrix
+from spadwarp.scene.scene import camera_port, laser_port
 from spadwarp.transport import truth_maps
 from spadwarp.values import ArgumentError, check_integer, count
 from spadwarp.viz import style
@@ -45,6 +46,7 @@ def draw_water(scene: Scene, path: str | Path, mesh: TriangleMesh | None = None,
     images = [draw_slice(axis, scene, mesh, across) for across, axis in enumerate(axes)]
     extend = "max" if max(image.get_array().max() for image in images) > images[0].norm.vmax else "neither"
     figure.colorbar(images[0], ax=axes, label="extinction [1/m]", shrink=0.7, extend=extend)
+    figure.key(axes, 1.1)
     return save(figure, path)
 
 
@@ -62,21 +64,26 @@ def draw_slice(axis: Axes, scene: Scene, mesh: TriangleMesh | None, across: int)
         _extinction(scene, points), extent=(0.0, depth, half, -half), vmin=0.0, vmax=top, aspect="equal",
         cmap=_PALE if scene.medium.grid is None else BOUND_MAP,
     )  # fmt: skip
-    camera, laser = scene.camera, scene.beam
+    camera, laser, side = scene.camera, scene.beam, np.eye(3)[across]
     tangent = 0.5 * camera.pixel_tangent * (camera.width, camera.height)[across]
-    start, along = np.array(laser.position), np.array(laser.axis)
-    slope, spread = along[across] / max(along[2], 1e-6), np.tan(min(laser.half_angle, 1.4))
-    for sign, last in ((-1.0, False), (1.0, True)):
-        view, beam = ("view", "beam") if last else (None, None)
-        axis.plot([0.0, depth], [0.0, sign * depth * tangent], color=style.BLUE, lw=0.8, label=view)
-        ends = start[across] + np.array([0.0, (slope + sign * spread) * (depth - start[2])])
-        axis.plot([start[2], depth], ends, color=style.GREEN, lw=0.8, ls="--", label=beam)
+    view: Any = ("camera", "view", "s", "-", style.BLUE, np.zeros(3), np.eye(3)[2], tangent, camera_port(scene))
+    spread, place = math.tan(min(laser.half_angle, 1.4)), np.array(laser.position)
+    beam: Any = ("laser", "beam", "^", "--", style.GREEN, place, np.array(laser.axis), spread, laser_port(scene))
+    for name, label, marker, line, colour, start, along, slope, port in (view, beam):
+        axis.plot(start[2], start[across], marker, color=colour, ms=4.0, clip_on=False, zorder=5, label=name)
+        for sign in (-1.0, 1.0):
+            point, ray = start, (along + sign * slope * side) / np.linalg.norm(along + sign * slope * side)
+            if port is not None:
+                point, ray, *_ = port.enter(start, ray)
+            # To the far end of the picture, or backwards.
+            far = point + ray * ((depth - point[2]) / ray[2] if ray[2] > 1e-6 else depth)
+            ends = np.array([start, point, far])
+            axis.plot(ends[:, 2], ends[:, across], line, color=colour, lw=0.8, label=label if sign > 0.0 else None)
     if mesh is not None:
         for ends in _section(mesh, 1 - across):
             axis.plot(ends[:, 2], ends[:, across], color="black", lw=1.2)
     axis.set(xlim=(0.0, depth), ylim=(half, -half), xlabel="z [m]", ylabel="xy"[across] + " [m]")
     axis.set_title(("from above", "from the side")[across])
-    axis.legend(loc="upper left", fontsize=6)
     return image
 
 

@@ -205,7 +205,7 @@ def wrapped(text: str, width: float, *, size: float = 8.0) -> str:
 def wrapped_items(text: str, width: float) -> str:
     """The same for items between commas and semicolons, which stay whole."""
     items = re.split("(?<=[,;]) ", text)
-    return wrapped(" ".join(item.replace(" ", "\N{NO-BREAK SPACE}") for item in items), width)
+    return wrapped(" ".join(item.replace(" ", "\N{NO-BREAK SPACE}") for item in items), width).replace(";\n", "\n")
 
 
 def power_text(value: float) -> str:
@@ -313,9 +313,12 @@ def mark_pixels(axis: Axes, missed: NDArray[np.bool_], invented: NDArray[np.bool
     axis.imshow(marks)
 
 
+MOST_HATCHED = 0.9  # part of the pixels from which on hatching would hide the image: words alone say what they are
+
+
 def hatch(axis: Axes, pixels: NDArray[np.bool_]) -> None:
     """Veils and hatches pixels that mean nothing."""
-    if pixels.any():
+    if 0.0 < pixels.mean() < MOST_HATCHED:
         padded = np.pad(pixels, 1).repeat(2, axis=0).repeat(2, axis=1)[1:-1, 1:-1].astype(np.float64)
         height, width = pixels.shape  # corners of the pixels, so that one alone is a square
         x, y = (np.repeat(np.arange(n + 1) - 0.5, 2) + np.tile([-1e-3, 1e-3], n + 1) for n in (width, height))

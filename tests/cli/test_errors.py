@@ -235,3 +235,21 @@ def test_short_memory_is_named(command, mebibytes, scene, tmp_path):
     said = ("not enough memory", "too little memory", "OpenBLAS error: Memory")
     assert done.returncode == 0 or (done.returncode == 1 and any(text in done.stderr for text in said))
     assert "Traceback" not in done.stderr and "bug" not in done.stderr
+
+
+@pytest.mark.parametrize(
+    ("words", "text"),
+    [
+        (("plan", "scene.toml", "--vary", "range=1,2"), "No such option: --vary; sweep has it"),
+        (("sweep", "scene.toml", "--eye-distance", "1"), "No such option: --eye-distance; plan has it"),
+        (("plan", "scene.toml", "--time", "10", "ms"), "write 10ms as one word"),
+        (("plan", "scene.toml", "--methd", "peak"), "(Possible options: --mesh, --method)"),
+    ],
+)
+def test_options_that_a_command_lacks_are_told_from_misspelt_ones(words, text):
+    assert text in run(*words, code=2).stderr
+
+
+def test_a_command_does_not_write_where_it_reads(done):
+    lines = run("detect", done, "--out", done, code=2).stderr
+    assert f"{done} is read by this command; name another directory" in lines and "frames.h5" not in lines

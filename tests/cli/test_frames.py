@@ -55,6 +55,8 @@ def test_frames_without_a_detection(done, tmp_path):
 
 
 def test_the_detector_can_be_another(done, tmp_path):
+    bright = ("--set", "laser.pulse_energy=1e-6", *DEVICE)
+    assert "warning: pile-up: " in run("detect", done, "--out", tmp_path / "bright", *bright).stderr
     dark = ("--set", "detector.dark_count_rate=1e7", "--set", "laser.pulse_energy=1e-20")
     options = (*dark, "--method", "peak", "--json", tmp_path / "dark.json", *DEVICE)
     run("detect", done, "--out", tmp_path / "dark", *options)

@@ -83,6 +83,23 @@ def test_sweep_is_that_of_python(scene, tmp_path, vary):
     assert {path.name for path in (tmp_path / "out").iterdir()} == {"sweep.png", "sweep.csv"}
 
 
+def test_a_sweep_of_plans_says_what_would_judge_and_that_energies_differ(scene, tmp_path):
+    few = ("--photons", "4000", "--no-range", *DEVICE)
+    printed = run("sweep", scene, "--vary", "detector.fill_factor=0.3,1", "--set", "laser.pulse_energy=1e-6", *few)
+    plain = " ".join(printed.stdout.split())
+    assert re.search(r"not judged: (about|more than) \S+ (photons )?would", plain) or "not judged" not in plain
+    assert "by likelihood" in plain and "the pulses have different energies, " in plain
+    refused = run("sweep", scene, "--vary", "gate.bins=100,200", *few, code=2).stderr
+    assert "gate.bins is what a plan proposes: vary gate.bin_width_ps" in refused
+
+
+def test_a_port_is_left_out_by_its_preset_none(scene):
+    port = ("--set", "camera.port.preset=flat-glass")
+    assert "port" not in run("check", scene, *port, "--set", "camera.port.preset=none").stdout
+    both = run("check", scene, "--set", "laser.port=camera", code=2).stderr
+    assert "needs a camera.port, such as camera.port.preset = 'flat-glass'" in both
+
+
 def test_plan_is_that_of_python_and_writes_a_scene(scene, tmp_path):
     summary, written = tmp_path / "printed.json", tmp_path / "planned.toml"
     options = ("--depth-error", "5cm", "--time", "100ms", "--photons", "2e4", "--no-range", "--write", written)

@@ -9,6 +9,7 @@ import pytest
 import spadwarp
 from helpers.scenes import scene
 from spadwarp.result import NOISE_GOAL, merge, noise_problem, photons_needed
+from spadwarp.result.analysis import noise_caption, with_frames
 from spadwarp.transport import simulation
 from spadwarp.transport.workers import trace_block
 
@@ -49,6 +50,9 @@ def test_ratio_falls_with_the_photons_and_names_those_that_would_do():
     assert f"about {photons:.1e} photons instead of 5.0e+03" in noise_problem(few)
     enough = spadwarp.simulate(scene(**DIM), photons=2 * round(photons), seed=2, **CPU)
     assert enough.target_noise_ratio < NOISE_GOAL and noise_problem(enough) == ""
+    bright = with_frames(few, 10_000, laser=few.scene.laser.model_copy(update={"pulse_energy": 10.0}))
+    assert noise_problem(bright).startswith("pile-up: ") and "less laser.pulse_energy" in noise_problem(bright)
+    assert "inf" not in noise_caption(bright.target_noise_ratio)
     one = spadwarp.simulate(scene(**DIM), photons=1, **CPU)
     assert one.batches == 1 and "not known" in noise_problem(one) and one.summary()["noise_ratio"] is None
 

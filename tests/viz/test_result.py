@@ -1,12 +1,14 @@
 """Previews: four readable pictures of any result, without warnings and without a display."""
 
 import dataclasses
+import math
 import re
 import subprocess
 import sys
 
 import numpy as np
 import pytest
+from matplotlib.figure import Figure
 from matplotlib.image import imread
 from PIL import Image
 
@@ -14,9 +16,11 @@ import spadwarp
 from helpers.cli import run
 from helpers.scenes import scene
 from helpers.synthetic_result import make_result, make_scene
+from spadwarp.scene.scene import camera_port
 from spadwarp.values import FileError
 from spadwarp.viz import draw_result
 from spadwarp.viz.result import merged_edges, merged_means
+from spadwarp.viz.scenes import draw_slice
 
 NAMES = ["depth.png", "intensity.png", "histogram.png", "truth.png"]
 
@@ -105,6 +109,19 @@ def test_slices_show_the_extinction(medium, tmp_path):
     path = spadwarp.viz.draw_water(scene(medium=medium), tmp_path / "water.png")
     colours = len(np.unique(np.asarray(Image.open(path).convert("L"))[50:-80, 100:600]))
     assert colours > (10 if medium else 1)
+
+
+def test_view_and_beam_behind_a_port_are_the_refracted_ones():
+    behind = scene().with_overrides({"camera.port.preset": "flat-glass", "laser.port": "camera"})
+    axis = Figure().subplots()
+    draw_slice(axis, behind, None, 0)
+    lines = {line.get_label(): line.get_xydata() for line in axis.lines}
+    inside, _, water = camera_port(behind).index
+    half = 0.5 * behind.camera.pixel_tangent * behind.camera.width
+    for name, angle in (("view", math.atan(half)), ("beam", behind.laser.half_angle)):
+        z, x = lines[name][-1] - lines[name][-2]
+        assert x / z == pytest.approx(math.tan(math.asin(inside / water * math.sin(angle))), rel=1e-6)
+    assert lines["camera"].tolist() == [[0.0, 0.0]] and lines["laser"][0, 1] == behind.laser.position[0]
 
 
 def test_check_draws_the_cells(tmp_path):
