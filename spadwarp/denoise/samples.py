@@ -16,7 +16,7 @@ from spadwarp.denoise.synthetic_noise import (
     procedural_scenes,
 )
 
-_WATER = (0.03, 0.85)  # part of a scene that is target, where it counts as a target in open water
+_WATER = (0.03, 0.5)  # part of a scene that is target, where it counts as a target in open water
 
 
 class Samples:
