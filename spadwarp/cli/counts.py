@@ -193,11 +193,17 @@ def depth(
 
     facts, files = opt.read_measured(inputs)
     seen = {name: facts.get(name) for name in _SEEN}
+    if ply is not None and ply.suffix.lower() != ".ply" and not spadwarp.io.is_stream(ply):
+        wrong(f"{ply}: points are written as .ply", "--ply")
     place = spadwarp.files.locate(path)
     reduced = spadwarp.files.stored_depth(spadwarp.load(place)) if spadwarp.files.is_own_file(place) else None
     if reduced is None:
         facts = {name: value for name, value in facts.items() if name not in _SEEN}
         histograms = read_histograms(place, channel=channel, **facts)
+        if ply is not None and histograms.scene is None and (ply_frame == "world" or not seen["horizontal_fov_deg"]):
+            lacking = "no pose in the world" if ply_frame == "world" else "no field of view"
+            hint = "--ply-frame camera" if ply_frame == "world" else "--input horizontal_fov_deg=60"
+            wrong(f"{path} has {lacking}, which points need: {hint}", "--ply")
         for text in histograms.notes:
             complain(text, "note")
     pixels = histograms.values[..., 0].size if reduced is None else reduced.values.size
@@ -212,10 +218,11 @@ def depth(
             complain(text, "note")
     comment = f"{path.name}, {reduced.method}"
     files = spadwarp.files.write_depth(reduced, out, ply=ply, ply_frame=ply_frame, comment=comment)
-    found = reduced.first[np.isfinite(reduced.first)]
-    metres = [float(of(found)) for of in (np.min, np.max, np.median)] if found.size else None
-    summary = {"pixels_with_return": int(found.size), "metres": metres, "quantity": reduced.quantity}
-    if 2 * found.size < pixels and min_significance != 0:
+    found = reduced.values[np.isfinite(reduced.values)]
+    of_all: dict[str, Any] = {"min": np.min, "median": np.median, "max": np.max}
+    metres = {name: float(of(found)) for name, of in of_all.items()} if found.size else None
+    summary = {"pixels": pixels, "pixels_with_return": int(found.size), "metres": metres, "quantity": reduced.quantity}
+    if 2 * found.size < pixels and min_significance != 0 and reduced.method != "stored":
         complain(
             f"{pixels - found.size} of {pixels} pixels have no significant return and so no depth; "
             "--min-significance 0 gives every pixel one, `spadwarp denoise` uses the pixels around it",
@@ -370,8 +377,8 @@ def _of_pixels(one: EstimateMap) -> str:
 
 
 _ENDINGS = (".npy", "_target.npy", "_confidence.npy", "_significance.npy", "_second.npy", ".exr", ".png")
-_OF_IMAGES = {"group_index": opt.real_number, "channel": str, "scale": opt.real_number, "as_depth": bool}
-_DenoiseInputs = Annotated[dict[str, Any], opt.items(opt.MEASURED | _OF_IMAGES)]
+_OF_IMAGES = {"channel": str, "scale": opt.real_number, "as_depth": bool}
+_DenoiseInputs = Annotated[dict[str, Any], opt.items(opt.MEASURED | _SEEN | _OF_IMAGES)]
 
 
 @command()
@@ -433,7 +440,7 @@ def denoise(
     paths = depth_files(path)
     stems = [one.stem for one in paths]
     if twice := sorted({one for one in stems if stems.count(one) > 1}):
-        raise FileError(f"{path}: several files are called {twice[0]!r} and would overwrite each other's results")
+        raise FileError(f"{path}: results of several files would be called {twice[0]!r}; name one of the files")
     needed = sum(one.stat().st_size for one in paths if one.is_file())
     names = [stem + ending for stem in stems for ending in _ENDINGS]
     level, known = _background(background)

@@ -17,7 +17,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from spadwarp.dataset import FrameReader, read_manifest
 from spadwarp.dataset.shards import SceneFile
-from spadwarp.denoise.baselines import CLASSICAL
+from spadwarp.denoise.baselines import BASELINES, CLASSICAL
 from spadwarp.denoise.frames import MARGIN, checked_gate, depth_frames
 from spadwarp.denoise.histograms import dim_pixels, second_return, target_bins, without_defects
 from spadwarp.denoise.inference import Estimate, detected, estimate_frames, estimate_histograms, target_threshold
@@ -25,7 +25,7 @@ from spadwarp.denoise.network_files import Precision, require_torch, weights_met
 from spadwarp.denoise.recipe import TrainingRecipe, load_training_recipe
 from spadwarp.files import Held, gate_of, holds_own_file, is_own_file, load, locate, sequence, stored_depth
 from spadwarp.frames.backgrounds import BackgroundLaw, profile_of_depth
-from spadwarp.frames.depth import Method, Quantity, depth_of
+from spadwarp.frames.depth import Method, Quantity, depth_of, geometry
 from spadwarp.frames.file import SequenceFile
 from spadwarp.frames.measured import Histograms, read_histograms, stored_images
 from spadwarp.io.arrays import read_exr, write_exr
@@ -96,7 +96,8 @@ def read_depth(
         gate: (start, stop) in depth [m]; of counts whose response is known, only the bins within it are used.
         group_index: Of measured histograms, see `depth_of`; default: that of the file.
         device: Warp device of the estimator.
-        measured: What a file of measured histograms does not say, as `read_histograms` takes it.
+        measured: What a file of measured histograms does not say, as `read_histograms` takes it; `horizontal_fov_deg`
+            for planar depth, see `depth_of`.
 
     Raises:
         FileError: No such file, not readable, or without depth.
@@ -146,14 +147,15 @@ def read_depth(
 
 
 def _read_histograms(path: Path, measured: dict[str, Any], group_index: float | None) -> Histograms:
+    view = {"group_index": group_index, "horizontal_fov_deg": measured.pop("horizontal_fov_deg", None)}
+    given = {name: value for name, value in view.items() if value is not None}
     histograms = read_histograms(path, **measured)
     notes = histograms.notes
     if histograms.scene is None and histograms.response is None:
         notes += ("the instrument response is not given (irf): with it, counts are denoised with their histograms",)
-    if group_index is not None and histograms.scene is not None:
-        raise ArgumentError(f"{path}: the file has its own group_index")
-    group_index = histograms.group_index if group_index is None else group_index
-    return dataclasses.replace(histograms, group_index=group_index, notes=notes)
+    if given and histograms.scene is not None:
+        raise ArgumentError(f"{path}: the file has its own {' and '.join(given)}")
+    return dataclasses.replace(histograms, **given, notes=notes)
 
 
 def _with_background(held: Histograms, given: ArrayLike | BackgroundLaw | None) -> Histograms:
@@ -230,10 +232,12 @@ def _estimate_depth(histograms: Histograms, counted: bool, method: Method | None
 
 
 def depth_at(time: NDArray[np.float64], histograms: Histograms) -> NDArray[np.float64]:
-    """Depth [m] at times of flight `[..., H, W]` [s]; range where the camera is not known."""
-    if histograms.scene is None:
-        return range_from_time(time, float(histograms.group_index or 1.0))
-    return depth_from_time(time, scene=histograms.scene)
+    """Depth [m] at times of flight `[..., H, W]` [s]; range where the view is not known."""
+    if histograms.scene is not None:
+        return depth_from_time(time, scene=histograms.scene)
+    index, lines = geometry(histograms)
+    distance = range_from_time(time, index)
+    return distance if lines is None else lines.depth_from_range(distance)
 
 
 def _within(held: Histograms, gate: tuple[float, float]) -> Histograms:
@@ -329,6 +333,8 @@ def denoise_file(
     if folder.resolve() == Path(path).resolve().parent:
         raise ArgumentError(f"out = {folder} is the folder of {path}; another is needed: nothing is overwritten")
     mask = None if mask is None else check_real("mask", mask, "[0, 1]")
+    if model not in BASELINES:
+        require_torch()  # before the work begins
     read = read_depth(path, gate=gate, **reading)
     notes, gate = [read.source], gate or read.gate
     valid = read.depth[np.isfinite(read.depth) & (read.depth > 0)]
@@ -369,8 +375,8 @@ def denoise_file(
     if empty := np.count_nonzero(np.isnan(depth).all(axis=(1, 2))):
         notes.append(f"{empty} of {len(depth)} frames are empty: nothing was reported, or no target is seen")
     if second is not None:
-        share = percent(np.isfinite(second).mean())
-        notes.append(f"{share} % of the pixels have a second return, of a surface or of light scattered into them")
+        some = f"{percent(np.isfinite(second).mean())} % of {second.size} pixels have"
+        notes.append(f"{some} a second return, of a surface or of light scattered into them")
     threshold = target_threshold(model) if mask is None else mask
     shown = found.masked(threshold)[0]
     files = _write(folder, name, read, Estimate(depth, *found[1:]), second, model)

@@ -43,6 +43,7 @@ class Histograms:
     bin_width: float | None = None  # [s]
     gate_start: float = 0.0  # time of flight at the lower edge of bin 0 [s]
     group_index: float | None = None  # of the water, where there is no scene
+    horizontal_fov_deg: float | None = None  # of a measuring camera with square pixels
     background: NDArray[np.float32] | None = None
     """Expected background in the unit of `values`, of a shape that `arrival_time` takes."""
     level_known: bool = True  # whether it is known apart from these values
@@ -288,7 +289,7 @@ def depth_of(
     }
     if any(value is None for value in missing.values()):
         raise ArgumentError("; ".join(text for text, value in missing.items() if value is None))
-    index, lines = _geometry(histograms, group_index, horizontal_fov_deg)
+    index, lines = geometry(histograms, group_index, horizontal_fov_deg)
     counted = values.dtype.kind in "iu"
     notes: tuple[str, ...] = ()
     if isinstance(background, int | float):
@@ -324,16 +325,17 @@ def depth_of(
     )
 
 
-def _geometry(
-    histograms: Histograms, group_index: float | None, horizontal_fov_deg: float | None
+def geometry(
+    histograms: Histograms, group_index: float | None = None, horizontal_fov_deg: float | None = None
 ) -> tuple[float, LinesOfSight | None]:
-    """Group index, and lines of sight where they are known."""
+    """Group index, and lines of sight where they are known; what is given replaces what the histograms hold."""
     scene = histograms.scene
     if scene is not None:
         if group_index is not None or horizontal_fov_deg is not None:
             raise ArgumentError("group index and field of view are those of the file's scene")
         return scene.medium.group_index, lines_of_sight(scene)
-    index = check_real("group index", group_index, field_range(Medium, "group_index"))
+    index = check_real("group index", group_index or histograms.group_index, field_range(Medium, "group_index"))
+    horizontal_fov_deg = horizontal_fov_deg or histograms.horizontal_fov_deg
     if horizontal_fov_deg is None:
         return index, None
     check_real("horizontal field of view", horizontal_fov_deg, field_range(Camera, "horizontal_fov_deg"))

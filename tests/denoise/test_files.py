@@ -106,6 +106,10 @@ def test_histograms_become_depth_first(tmp_path):
     found = denoise_file(path, out, model="median", bin_width=100e-12, gate_start=10e-9, group_index=index)
     assert abs(np.median(found.depth) - 2.0) < 0.005
     assert found.gate == pytest.approx((speed / 2 * 10e-9, speed / 2 * 35.6e-9))
+    facts = {"bin_width": 100e-12, "gate_start": 10e-9, "group_index": index, "horizontal_fov_deg": 60.0}
+    seen = denoise_file(path, tmp_path / "seen", model="pooled", **response(350e-12), **facts)  # planar: z of a sphere
+    tangent = np.tan(np.radians(30.0)) * 2**0.5 * np.array([15.5, 0.5]) / 16
+    assert seen.depth[0, [0, 16], [0, 16]] == pytest.approx(2.0 / np.hypot(1.0, tangent), rel=0.01)
     with pytest.raises(ArgumentError, match="another is needed"):
         denoise_file(path, tmp_path)
     with pytest.raises(ArgumentError, match="bin width is missing"):
