@@ -9,11 +9,9 @@ from __future__ import annotations
 import math
 import subprocess
 import time
-import tomllib
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import asdict, dataclass, field, fields, replace
-from importlib.resources import files
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
@@ -22,7 +20,7 @@ import numpy as np
 from spadwarp.analytic import simulate_analytic
 from spadwarp.device import core_count, nvidia_driver, pick_device, processor_name
 from spadwarp.frames import detect
-from spadwarp.io.text import read_json
+from spadwarp.io.text import read_json, read_toml
 from spadwarp.mesh import build_mesh
 from spadwarp.scene import Detector, Laser, Scene
 from spadwarp.transport import provenance, simulate, trace, truth_maps
@@ -54,7 +52,7 @@ class Case:
     time_limit: float = math.inf  # seconds of timed runs after which none is repeated
 
 
-_SCENES = tomllib.loads((files("spadwarp") / "benchmark.toml").read_text(encoding="utf-8"))
+_SCENES = read_toml(Path(__file__).with_name("benchmark.toml"))
 
 
 def _at_5m(targets: str | None = None, **changes: Mapping[str, Any]) -> dict[str, Any]:

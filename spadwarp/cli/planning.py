@@ -209,7 +209,7 @@ def _terms(found: Proposal) -> dict[str, str]:
     return {title: "mm"} | {name: f"{short(1000 * value):<6}  {about[name]}" for name, value in found.terms.items()}
 
 
-@command()
+@command(prints_result=True)
 def sweep(
     scene: Path,
     *,

@@ -129,12 +129,12 @@ def _list_examples(kind: str | None, name: str | None) -> None:
             say(f"{one}: {_USES[one]}\n{rows(headings, indent='  ')}")
         write_json(known)
         return
-    found = [paths[name] for paths in known.values() if name in paths]
+    found = {one: {name: paths[name]} for one, paths in known.items() if name in paths}
     if not found:
         hint = suggestion(name, [one for paths in known.values() for one in paths])
         wrong(f"{name!r} is not one of `spadwarp list {kind}`{hint}", "NAME")
-    for path in found:
-        say(path.read_text(encoding="utf-8").rstrip())
+    say("\n".join(paths[name].read_text(encoding="utf-8").rstrip() for paths in found.values()))
+    write_json(found)
 
 
 def _heading(text: str) -> str:

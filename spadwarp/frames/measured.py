@@ -336,13 +336,13 @@ def _read_arrays(
     known = width if 1e-15 < width < 1e-3 else None
     if bin_width is None and known is not None:
         notes.append(f"bin width {known * 1e12:g} ps from the file")
-    index = numbers.get("group_index", 0.0)
+    start, index = numbers.get("gate_start", math.nan), numbers.get("group_index", 0.0)
     is_sparse = isinstance(value, SparseMatrix)
     if is_sparse:
         value = _of_sparse(value, image_size, variables)
         notes.append(f"{value.shape[1]} x {value.shape[0]} pixels, column by column")
     options = ("dataset", "image_size" if is_sparse else "axes")[not name :]
-    facts = (known, numbers.get("gate_start"), index if 1.0 <= index <= 3.0 else None)
+    facts = (known, start if abs(start) < 1e-2 else None, index if 1.0 <= index <= 3.0 else None)
     return _Raw(value, tuple(notes), *facts, ordered=is_sparse, options=options)
 
 

@@ -114,15 +114,13 @@ def read_npy(path: str | Path, *, largest: int | None = None) -> NDArray[Any]:
     with reading(path), place.open("rb") as file:
         if file.read(4)[:2] == b"PK":
             raise FileError(f"{path}: a .npz archive, not a .npy file; write one array with numpy.save")
-        file.seek(0)
         return _array(file, f"{path}:", place.stat().st_size, "biufc", largest)
 
 
 def read_npz(path: str | Path, *, names: Collection[str] | None = None, largest: int) -> dict[str, NDArray[Any]]:
-    """Those arrays of a `.npz` archive that have one of the names, by default all of numbers; pickles are never loaded.
+    """Arrays of numbers of a `.npz` archive: all, or those that have one of the names; pickles are never loaded.
 
-    `largest`: allowed number of values of an array. Raises `FileError`: no such file, not a `.npz` archive, shorter
-    than a header says, of another type, or too large.
+    `largest`: allowed number of values of an array. Raises `FileError` as `read_npy` does.
     """
     place = existing_file(path)
     arrays: dict[str, NDArray[Any]] = {}
@@ -131,19 +129,14 @@ def read_npz(path: str | Path, *, names: Collection[str] | None = None, largest:
             name = info.filename.removesuffix(".npy")
             if names is None or name in names:
                 with archive.open(info) as file:
-                    arrays[name] = _array(
-                        file, f"{path}: {name}", info.file_size, "biuf" if names else "biufU", largest
-                    )
-    return {name: array for name, array in arrays.items() if array.dtype.kind != "U"}
+                    if names is not None or _header(file)[2].kind in "biuf":
+                        arrays[name] = _array(file, f"{path}: {name}", info.file_size, "biuf", largest)
+    return arrays
 
 
 def _array(file: Any, where: str, size: int, kinds: str, largest: int | None) -> NDArray[Any]:
     """The array of an open file of so many bytes, whose header is compared with them before anything is allocated."""
-    version = np.lib.format.read_magic(file)
-    readers = {(1, 0): np.lib.format.read_array_header_1_0, (2, 0): np.lib.format.read_array_header_2_0}
-    if version not in readers:
-        raise ValueError(f"format version {version}")
-    shape, _, kind = readers[version](file)
+    shape, _, kind = _header(file)
     values, available = math.prod(shape), size - file.tell()
     if kind.kind not in kinds:
         raise FileError(f"{where} holds {kind}; numbers are needed")
@@ -153,6 +146,13 @@ def _array(file: Any, where: str, size: int, kinds: str, largest: int | None) ->
         raise FileError(f"{where} cut: {kind} {shape} takes {values * kind.itemsize} bytes, and {available} are there")
     file.seek(0)
     return np.lib.format.read_array(file, allow_pickle=False)
+
+
+def _header(file: Any) -> tuple[tuple[int, ...], bool, np.dtype[Any]]:
+    """Shape, order and type of the array of an open file."""
+    file.seek(0)
+    first = np.lib.format.read_magic(file) == (1, 0)  # of the versions; 3.0 is as 2.0, but for names of columns
+    return np.lib.format.read_array_header_1_0(file) if first else np.lib.format.read_array_header_2_0(file)
 
 
 # Point clouds

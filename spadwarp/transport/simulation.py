@@ -260,10 +260,10 @@ class _Run:
             error, batches = rule.error_of(result), result.photons // size
             wanted = rule.next_look(batches, error, partial(largest_share, result))
             needed = result.photons * (error / rule.goal) ** 2
-            text = f"error {100 * error:.3g} %" if rule.is_relative else f"noise ratio {error * error:.3g}"
-            text += f" after {result.batches} batches"
-            text += f"; about {needed:.2g} photons are needed" if rule.goal < error < math.inf else ""
-            self._report(text, result.photons, self._photons)
+            if error < math.inf:
+                text = f"error {100 * error:.3g} %" if rule.is_relative else f"noise ratio {error * error:.3g}"
+                more = f"; about {needed:.2g} photons are needed" if rule.goal < error else ""
+                self._report(f"{text} after {result.batches} batches{more}", result.photons, self._photons)
             if wanted is None or result.photons >= stop - start or deadline - now < _LEAST_PART * (now - began):
                 self._report("trace", result.photons, result.photons)
                 end = ids[-1][1]

@@ -3,16 +3,16 @@
 from __future__ import annotations
 
 import math
-import tomllib
-from importlib.resources import files
+from pathlib import Path
 from typing import Any, NamedTuple
 
-_VALUES: dict[str, Any] = tomllib.loads((files("spadwarp.validate") / "references.toml").read_text(encoding="utf-8"))
+from spadwarp.io.text import read_toml
+
+_VALUES = read_toml(Path(__file__).with_name("references.toml"))
 
 
 class Slab(NamedTuple):
-    """An index-matched slab, normal incidence: fractions that leave it, `transmitted` with the direct beam, or their
-    derivatives."""
+    """Index-matched, normal incidence: fractions that leave it, `transmitted` with the direct beam; or derivatives."""
 
     anisotropy: float
     albedo: float

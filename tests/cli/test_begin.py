@@ -61,7 +61,8 @@ def test_examples_go_by_name(tmp_path, monkeypatch):
     known = tables("printed.json")
     assert {path.stem for path in (ROOT / "configs" / "scenes").glob("*.toml")} == set(known["scenes"])
     assert all(name in printed for names in known.values() for name in names)
-    assert run("list", "scenes", "plane_5m").stdout.startswith("# A grey wall")
+    assert run("list", "scenes", "plane_5m", "--json", "one.json").stdout.startswith("# A grey wall")
+    assert tables("one.json") == {"scenes": {"plane_5m": known["scenes"]["plane_5m"]}}
     assert spadwarp.load_scene("plane_5m") == spadwarp.load_scene(ROOT / "configs" / "scenes" / "plane_5m.toml")
     assert spadwarp.dataset.load_recipe("small").name == "spadwarp small"
     assert spadwarp.denoise.load_training_recipe("usdn").model == "usdn"

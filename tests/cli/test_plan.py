@@ -49,7 +49,7 @@ def test_analytic_takes_truth_and_profile_from_files(scene, done, tmp_path):
 def test_budget_is_that_of_python(scene, tmp_path):
     summary, out = tmp_path / "printed.json", tmp_path / "out"
     waters = ("--medium", "uwoc-clear", "--medium", "uwoc-harbour")
-    printed = run("sweep", scene, "--vary", "range=1:3:3", *waters, "--out", out, "--json", summary, *DEVICE)
+    printed = run("sweep", scene, "--vary", "range=1:3:3", *waters, "--out", out, "--json", summary, "--quiet", *DEVICE)
     twin = spadwarp.budget(scene, [1, 2, 3], ["uwoc-clear", "uwoc-harbour"], device="cpu")
     assert [row["signal"] for row in tables(summary)["rows"]] == [row.signal for row in twin]
     assert "uwoc-harbour" in printed.stdout and "gate [ns]" in printed.stdout and "σ* [mm]" in printed.stdout

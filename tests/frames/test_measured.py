@@ -110,6 +110,18 @@ def test_every_kind_of_file_holds_the_same_histograms(files, request, name, opti
     assert found.gate_start == pytest.approx(28e-12 if "tag_unit" in options else 0.0)
 
 
+def test_facts_beside_an_array_are_read_where_they_are_seconds(tmp_path):
+    others = {"camera": np.array([None]), "lens": np.array("25 mm")}
+    np.savez(tmp_path / "a.npz", counts=COUNTS, bin_width=4e-12, gate_start=2e-9, group_index=1.33, **others)
+    found = read_histograms(tmp_path / "a.npz")
+    assert (found.bin_width, found.gate_start, found.group_index) == (4e-12, 2e-9, 1.33)
+    with h5py.File(tmp_path / "a.h5", "w") as file:  # picoseconds and nanoseconds
+        file["counts"], file["bin_width"], file["gate_start"] = COUNTS, 4.0, 2.0
+    with pytest.warns(SpadwarpWarning, match="gate start is not given"):
+        found = read_histograms(tmp_path / "a.h5")
+    assert found.bin_width is None and found.gate_start == 0.0
+
+
 WIDER = r"are .* a wider bin than 4 ps \(bin_width\) would help"
 
 

@@ -56,6 +56,7 @@ def test_gpus_get_ptx_or_machine_code_as_their_driver_reads(archive, tmp_path, m
     gpus = [("ptx", 80), ("ptx", 80), ("ptx", 120), ("cubin", 89), ("cubin", 90), ("cubin", 75)]
     answers = ("get_cuda_output_format.return_value", "get_cuda_compile_arch.return_value")
     made = [Mock(**dict(zip(answers, gpu, strict=True))) for gpu in gpus]
+    made.insert(0, Mock(**{"get_cuda_compile_arch.side_effect": RuntimeError("too old for this Warp")}))
     monkeypatch.setattr(wp, "get_cuda_devices", lambda: made)
     archive(features=())
     assert unpack_kernels() == 3

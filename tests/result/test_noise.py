@@ -99,6 +99,10 @@ def test_auto_stops_at_the_goal_or_in_time_with_the_bits_of_its_photons(monkeypa
         slept.append(trace_block(*arguments))
         return slept[-1]
 
+    seen.clear()
+    spadwarp.simulate(bright, seed=1, time=1e-3, **CPU, progress=lambda stage, *_: seen.append(stage))
+    assert seen and not any("inf" in stage for stage in seen)  # of one batch no noise ratio is known
+
     slept = []
     monkeypatch.setattr(simulation, "trace_block", ever_slower)
     cut = spadwarp.simulate(bright, seed=1, time=1.5, **CPU)

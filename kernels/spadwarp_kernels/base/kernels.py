@@ -105,8 +105,8 @@ def unpack_kernels() -> int:
     For programs of their own, before their first kernel; `spadwarp` calls it.
 
     Returns:
-        The number of modules added: 0 where the package has none for this version of Warp, system, processor and
-        GPUs, and where it is damaged or the cache cannot be written.
+        The number of modules added, those of CPUs, PTX and machine code apart: 0 where the package has none for this
+        version of Warp, system, processor and GPUs, and where it is damaged or the cache cannot be written.
     """
     if not ARCHIVE.exists():
         return 0
@@ -129,10 +129,10 @@ def _endings() -> defaultdict[str, set[str]]:
         # The end of this key is what Warp adds to the names of objects for the processor at hand.
         endings["o"].add(f"cpu{wp.get_cpu_kernel_cache_key().rpartition('-')[2]}.o")
     for device in wp.get_cuda_devices():
-        kind, arch = device.get_cuda_output_format(), device.get_cuda_compile_arch()
-        made = [PTX] if kind == "ptx" else [other for other in CUBIN if other // 10 == arch // 10 and other <= arch]
-        for other in made:
-            endings[f"sm{other}.{kind}"].add(f"sm{arch}.{kind}")
+        with contextlib.suppress(RuntimeError):  # of a GPU that this Warp cannot compile for
+            kind, arch = device.get_cuda_output_format(), device.get_cuda_compile_arch()
+            for other in [PTX] if kind == "ptx" else [one for one in CUBIN if one // 10 == arch // 10 and one <= arch]:
+                endings[f"sm{other}.{kind}"].add(f"sm{arch}.{kind}")
     return endings
 
 

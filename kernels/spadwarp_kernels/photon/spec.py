@@ -98,8 +98,8 @@ class TransportSpec(NamedTuple):
     lines: bool = False
     """Photons carry light of other wavelengths, see `Model.lines`, of which each of `channels` is one; not in cells."""
     points: int = 1
-    """At how many points of a flight `guided` scores it, 1 to MOST_POINTS; more than one without `reflecting`, `blocks`
-    and DELTA_TRACKING, three with up to 4 derivatives."""
+    """At how many points of a flight `guided` scores it, 1 to MOST_POINTS (1 if it leads aside); more than one without
+    `reflecting`, `blocks` and DELTA_TRACKING, three with up to 4 derivatives."""
     flux: tuple[str, ...] = ()
     """Kinds of the sections of `Model.flux`, each one of FLUX_KINDS; for estimators that neither guide light nor let
     it fly on after its last event, and without `polarised`."""

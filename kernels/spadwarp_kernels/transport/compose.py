@@ -142,7 +142,7 @@ def _make_asks(spec: TransportSpec, take: wp.Function) -> tuple[wp.Function, wp.
         if wp.static(flights):
             if is_planned(s.flight):
                 request = estimator.request_flight(s)
-                aside = wp.static(spec.points > 1) and leads_aside(s)  # more points take off nothing
+                aside = wp.static(spec.points > 1) and leads_aside(s)  # more points take no noise off
                 request.weight *= wp.where(aside, 1.0, wp.static(1.0 / spec.points))
                 take(s, request, world, sink, memory)
                 for i in range(wp.static(spec.points - 1)):
