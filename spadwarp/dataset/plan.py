@@ -19,6 +19,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from spadwarp.dataset.recipe import SPLITS, UNIFORM, Distribution, Plume, Recipe, Targets
+from spadwarp.io.paths import similar
 from spadwarp.mesh import BUILTINS, builtin_names, load_target
 from spadwarp.mesh.files import USD_ENDINGS
 from spadwarp.mesh.targets import placement
@@ -26,7 +27,7 @@ from spadwarp.result import Truth, load_truth_exr
 from spadwarp.scene import Camera, Scene, Target, Trajectory, load_trajectory
 from spadwarp.scene.pose import rotation_angles
 from spadwarp.scene.sight import port_advance
-from spadwarp.values import ConfigError, FileError, MeshError, time_from_range
+from spadwarp.values import ConfigError, FileError, MeshError, suggestion, time_from_range
 
 __all__ = ["Plan"]
 
@@ -138,7 +139,8 @@ def find_targets(recipe: Recipe) -> tuple[TargetSource, ...]:
     for split in ("validation", "test"):
         for name in getattr(chosen, split):
             if name not in splits:
-                problems.append(f"targets.{split}: {name!r} is not one of the dataset's targets")
+                listed = f"{', '.join(map(repr, splits))}{suggestion(name, [*splits])}"
+                problems.append(f"targets.{split}: {name!r} is not one of the dataset's targets, {listed}")
             elif splits[name] != "train":
                 problems.append(f"targets.{split}: {name!r} is already in {splits[name]}")
             else:
@@ -160,7 +162,8 @@ def _files(
         found = [one for one in files if one == path or (one.stem.endswith(ending) and one.suffix.lower() in suffixes)]
         if not found:
             what = "mesh file" if not ending else f"file *{ending}.EXR"
-            raise error(f"targets.{'exports' if ending else 'meshes'}: {path}: no {what} there")
+            problem = f"no {what} there" if path.exists() else f"no such file or folder{similar(path)}"
+            raise error(f"targets.{'exports' if ending else 'meshes'} = {path}: {problem}")
         yield from found
 
 

@@ -31,6 +31,7 @@ from spadwarp.frames.measured import Histograms, read_histograms, stored_images
 from spadwarp.io.arrays import read_exr, write_exr
 from spadwarp.io.paths import atomic_path, existing_file
 from spadwarp.result import Result
+from spadwarp.scene.sections import file_of
 from spadwarp.scene.sight import depth_from_time
 from spadwarp.transport import PhotonRecords
 from spadwarp.values import ArgumentError, FileError, check_real, percent, range_from_time
@@ -502,7 +503,8 @@ def train(
         recipe = load_training_recipe(recipe)
     training = validation = None
     if recipe.data is not None:
-        training, validation = (read_scenes(recipe.data, split) for split in ("train", "validation"))
+        with file_of("data"):
+            training, validation = (read_scenes(recipe.data, split) for split in ("train", "validation"))
     trained = fit(recipe, training, validation, Path(out), device=device, progress=progress, notify=notify)
     if trained.log.is_file() and trained.log.stat().st_size:
         log = [json.loads(line) for line in trained.log.read_text().splitlines()]

@@ -255,7 +255,7 @@ def evaluate(
         SpadwarpError: A package of the extra `denoise` is missing.
     """
     for name in models:
-        check_choice("models: an item", name, METHODS)
+        check_choice("models", name, METHODS)
     wanted = [name for name in dict.fromkeys(models) if name != "bm3d"] + ["bm3d"] * (bm3d_frames > 0)
     if counting := [name for name in wanted if name in ("histograms", *CLASSICAL)]:
         raise ArgumentError(

@@ -49,7 +49,7 @@ def example_or_path(path: str | os.PathLike[str], kind: str) -> Path:
         named = f"{place.name}.toml"
         close = [named] if os.path.exists(named) else difflib.get_close_matches(place.name, known, n=1)
         hint = f"did you mean {close[0]!r}?" if close else f"known are {', '.join(known)}"
-        raise FileError(f"{place}: neither a file nor one of the {kind} that come with spadwarp; {hint}")
+        raise FileError(f"{place}: neither a file nor one of `spadwarp list {kind}`; {hint}")
     return known[place.name]
 
 
@@ -97,6 +97,8 @@ def existing_file(path: str | Path) -> Path:
     if (problem := file_problem(path)) is not None:
         scene = str(path) in examples("scenes")
         hint = f"; `spadwarp simulate {path} --out DIR` makes a result of this scene" if scene else similar(path)
+        if os.path.isdir(path):
+            hint = f"; it is a folder, which holds {', '.join(sorted(os.listdir(path))[:6]) or 'nothing'}"
         raise FileError(f"{path}: {problem}{hint}")
     return Path(path)
 
