@@ -341,7 +341,7 @@ class Panels:
         height = float(np.clip((self._cell - 0.35) * shape[0] / shape[1], 0.5, 5.0))
         # Titles, numbers and labels.
         self.figure = new_figure(width, lines * (height + 1.1) + sum(below) + 0.45 * bool(below))
-        self.figure.get_layout_engine().set(wspace=0.05, h_pad=0.05)  # type: ignore[call-arg,union-attr]
+        self.figure.get_layout_engine().set(wspace=0.05, h_pad=0.1)  # type: ignore[call-arg,union-attr]
         ratios = [*[height, 0.1] * lines, *below]
         grid = self.figure.add_gridspec(len(ratios), columns, height_ratios=ratios)
         self._free = iter([(grid[2 * k, c], grid[2 * k + 1, c]) for k in range(lines) for c in range(columns)])
@@ -402,7 +402,8 @@ class Panels:
     def show_depth(
         self, image: NDArray[Any], title: str, limits: tuple[float, float], label: str = LABELS["depth"]
     ) -> Axes:
-        """Depth [m]."""
+        """Depth [m]; the label says what is grey."""
+        label += "\ngrey: no depth" * bool(np.isnan(image).any() and np.isfinite(image).any())
         return self.show(image, title, label, DEPTH_MAP, limits)
 
     def show_error(self, error: NDArray[Any], title: str) -> None:
@@ -462,12 +463,14 @@ def shown_limits(
     """Lowest and highest value, at least 1 cm apart, without `beyond` percent at each end; the margin is relative.
 
     With `weights`, such as counts, percent of their sum: depths of pixels with hardly any counts are spread over the
-    gate, and those of the target would have one colour.
+    gate, and those of the target would have one colour. A single pixel decides neither end.
     """
     known = np.isfinite(image)
     if weights is not None and (weights[known] > 0).any():  # those of NaN count for nothing
         known &= weights > 0
         each = weights[known].astype(np.float64)
+        for _ in range(3 * bool(beyond)):
+            each = np.minimum(each, 0.005 * beyond * each.sum())
         ends = np.quantile(image[known], (beyond / 100, 1.0 - beyond / 100), weights=each, method="inverted_cdf")
     else:
         ends = np.percentile(image[known], (beyond, 100.0 - beyond)) if known.any() else np.array([0.0, 1.0])
