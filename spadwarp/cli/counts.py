@@ -74,19 +74,9 @@ def detect(
     counted = min(shots, bins) if scene.detector.mode == "first_photon" else bins
     needed = max(frames, 0) * scene.camera.width * scene.camera.height * (4 * counted + 4 * len(methods) + 8)
     check_outputs(out, ("frames.h5", "frame.png"), inputs=(run,), needed=needed + (16 << 20))
-    recording = spadwarp.frames.record_frames(
-        result,
-        out / "frames.h5",
-        pulses=pulses,
-        frames=frames,
-        seed=seed,
-        methods=methods,
-        undo_pile_up=coates,
-        tags=tags,
-        window=recorded,
-        device=device,
-        progress=progress("frames"),
-    )
+    options: dict[str, Any] = {"pulses": pulses, "frames": frames, "seed": seed, "methods": methods, "tags": tags}
+    options |= {"undo_pile_up": coates, "window": recorded, "device": device, "progress": progress("frames")}
+    recording = spadwarp.frames.record_frames(result, out / "frames.h5", **options)
     for text in (*recording.file.notes, *_bound_noise(recording, result.photons)):
         complain(text, "note")
     files = [recording.file.path, spadwarp.viz.draw(recording.file, out / "frame.png", pixel=pixel)]
@@ -200,10 +190,8 @@ def depth(
     if reduced is None:
         facts = {name: value for name, value in facts.items() if name not in _SEEN}
         histograms = read_histograms(place, channel=channel, **facts)
-        if ply is not None and histograms.scene is None and (ply_frame == "world" or not seen["horizontal_fov_deg"]):
-            lacking = "no pose in the world" if ply_frame == "world" else "no field of view"
-            hint = "--ply-frame camera" if ply_frame == "world" else "--input horizontal_fov_deg=60"
-            wrong(f"{path} has {lacking}, which points need: {hint}", "--ply")
+        if ply is not None and histograms.scene is None and seen["horizontal_fov_deg"] is None:
+            wrong(f"{path} has no field of view, which points need: --input horizontal_fov_deg=60", "--ply")
         for text in histograms.notes:
             complain(text, "note")
     pixels = histograms.values[..., 0].size if reduced is None else reduced.values.size
@@ -446,14 +434,13 @@ def denoise(
     level, known = _background(background)
     check_outputs(out, names, inputs=(*paths, profile, level, weights, *files), needed=needed)
     settings: dict[str, Any] = {"model": model, "gate": depths, "weights": weights, "device": device, "mask": mask}
-    settings["min_significance"] = min_significance
-    settings["background"] = known
+    settings |= {"min_significance": min_significance, "background": known, "precision": precision}
     settings["profile"] = None if profile is None else spadwarp.io.read_npy(profile, largest=1 << 20)
     lines: dict[str, str] = {}
     summary: list[dict[str, Any]] = []
     for number, one in enumerate(paths, 1):
         try:
-            done = denoise_file(one, out, precision=precision, **settings, **facts)
+            done = denoise_file(one, out, **settings, **facts)
         except (ConfigError, FileError, ArgumentError) as error:
             text = str(error) if str(one) in str(error) else f"{one}: {error}"
             if len(paths) == 1:

@@ -286,10 +286,8 @@ class Recipe(Document):
         camera = self.scene.get("camera")
         polarisation = camera.get("polarisation", "none") if isinstance(camera, Mapping) else "none"
         if self.monte_carlo.channel != "I" and polarisation == "none" and "camera.polarisation" not in self.vary:
-            yield (
-                f"monte_carlo.channel = {self.monte_carlo.channel!r} needs scene.camera.polarisation = 'analyser' or "
-                "'stokes'"
-            )
+            needed = "scene.camera.polarisation = 'analyser' or 'stokes'"
+            yield f"monte_carlo.channel = {self.monte_carlo.channel!r} needs {needed}"
         if not self.targets.exports and self.gate.before.limits[1] >= (far := self.pose.distance.limits[1]):
             yield f"gate.before = {self.gate.before.limits[1]:g} is outside (0, {far:g}) m, up to pose.distance"
         for name in self.vary:

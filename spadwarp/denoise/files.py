@@ -46,7 +46,7 @@ if TYPE_CHECKING:
 
 ENDINGS = (".h5", ".hdf5", ".exr", ".npy", ".mat", ".ptu")
 
-_JUDGED = 50  # frames in which a denoiser that makes depth worse is looked for
+_JUDGED = 1 << 19  # pixels, of which is told whether a denoiser makes them worse
 _EXR_CHANNELS = ("Z", "depth", "range", "A", "Depth.Z", "Depth.V")
 
 
@@ -221,15 +221,12 @@ def _estimate_depth(histograms: Histograms, counted: bool, method: Method | None
     depth = reduced.values.astype(np.float32)
     depth[depth <= 0.0] = np.nan  # a peak of noise at the time of the pulse
     dim = [] if counted else dim_pixels(histograms)
+    source = "; ".join([f"{reduced.quantity} by {method} from histograms", *histograms.notes, *dim])
     return DepthReading(
-        depth=depth,
-        quantity=reduced.quantity,
-        frames=reduced.frames > 1,
-        gate=(range_from_time(histograms.gate_start, index), range_from_time(gate_stop, index)),
-        profile=backscatter_profile(histograms),
-        source="; ".join([f"{reduced.quantity} by {method} from histograms", *histograms.notes, *dim]),
+        depth=depth, quantity=reduced.quantity, frames=reduced.frames > 1, profile=backscatter_profile(histograms),
+        gate=(range_from_time(histograms.gate_start, index), range_from_time(gate_stop, index)), source=source,
         histograms=histograms if counted else None,
-    )
+    )  # fmt: skip
 
 
 def depth_at(time: NDArray[np.float64], histograms: Histograms) -> NDArray[np.float64]:
@@ -398,18 +395,16 @@ def _worse(depth: NDArray[np.float32], found: NDArray[np.float32], model: str, g
     On surfaces of the input alone, where of 5 × 5 pixels half of the depths, five or more, are within a hundredth of
     the gate from their median. From it a pixel's noise is measured, also of one that reported backscatter.
     """
-    pairs = [np.empty((2, 0))]
-    for before, after in zip(depth[:_JUDGED], found[:_JUDGED], strict=True):
-        around = np.lib.stride_tricks.sliding_window_view(np.pad(before, 2, constant_values=np.nan), (5, 5))
-        ascending = np.sort(around.reshape(*before.shape, 25), axis=-1)  # NaN last
-        reported = np.isfinite(ascending).sum(axis=-1, keepdims=True)
-        middle = np.take_along_axis(ascending, np.maximum(reported - 1, 0) // 2, axis=-1)
-        agreeing = (np.abs(ascending - middle) < 0.01 * (gate[1] - gate[0])).sum(axis=-1, keepdims=True)
-        pair = np.abs([before - middle[..., 0], after - before])
-        pairs.append(pair[:, (agreeing >= np.maximum(5, 0.5 * reported))[..., 0] & np.isfinite(pair).all(axis=0)])
-    if not (both := np.concatenate(pairs, axis=1)).size:
-        return []
-    noise, moved = np.quantile(both, (0.5, 0.99), axis=1).T
+    depth, found = (one[: max(1, _JUDGED // depth[0].size)] for one in (depth, found))
+    padded = np.pad(depth, ((0, 0), (2, 2), (2, 2)), constant_values=np.nan)
+    around = np.lib.stride_tricks.sliding_window_view(padded, (5, 5), (1, 2)).reshape(*depth.shape, 25)
+    ascending = np.sort(around, axis=-1)  # NaN last
+    reported = np.isfinite(ascending).sum(axis=-1, keepdims=True)
+    middle = np.take_along_axis(ascending, np.maximum(reported - 1, 0) // 2, axis=-1)
+    agreeing = (np.abs(ascending - middle) < 0.01 * (gate[1] - gate[0])).sum(axis=-1, keepdims=True)
+    pair = np.abs([depth - middle[..., 0], found - depth])
+    surface = (agreeing >= np.maximum(5, 0.5 * reported))[..., 0] & np.isfinite(pair).all(axis=0)
+    noise, moved = np.quantile(pair[:, surface], (0.5, 0.99), axis=1).T if surface.any() else np.zeros((2, 2))
     if not ((moved > 1.8 * noise).all() and moved[0] > 1e-4):
         return []
     usual = 1e3 * noise[0] / 0.6745  # standard deviation

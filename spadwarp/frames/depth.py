@@ -313,16 +313,12 @@ def depth_of(
     path = path_from_time(time.reshape(-1, height, width), index)
     distance = 0.5 * path if lines is None else lines.range_from_path(path)
     return Reduction(
-        quantity="range" if lines is None else "depth",
+        quantity="range" if lines is None else "depth", range=distance, lines=lines, method=method, notes=notes,
         values=distance if lines is None else lines.depth_from_range(distance),
-        range=distance,
         intensity=values.sum(axis=-1).reshape(-1, height, width),
-        lines=lines,
-        method=method,
         camera=None if histograms.scene is None else histograms.scene.camera,
         significance=None if significance is None else significance.reshape(-1, height, width),
-        notes=notes,
-    )
+    )  # fmt: skip
 
 
 def geometry(

@@ -150,10 +150,8 @@ def read_histograms(
 def _check_response(irf: InstrumentResponse, bin_width: float, length: float, path: Path) -> None:
     """Refuses a response longer than the histograms [s], and warns of one far shorter than a bin."""
     if not irf.fwhm < length:
-        raise ArgumentError(
-            f"{path}: irf = {irf.fwhm:.4g} s (full width at half maximum) is outside [0, {length:.4g}) s: the "
-            f"histograms are {length:.4g} s long; with a unit, write irf=300ps"
-        )
+        text = f"irf = {irf.fwhm:.4g} s (full width at half maximum) is outside [0, {length:.4g}) s, the length of the"
+        raise ArgumentError(f"{path}: {text} histograms; with a unit, write irf=300ps")
     if irf.fwhm < _LEAST_RESPONSE * bin_width:
         pair = f"irf = {irf.fwhm * 1e12:.4g} ps is {irf.fwhm / bin_width:.2g} of bin_width = {bin_width * 1e12:.4g} ps"
         warnings.warn(f"{path.name}: {pair}; one of the two may be of another unit", SpadwarpWarning, stacklevel=3)
@@ -170,26 +168,17 @@ def _read_own(path: Path, channel: Channel) -> Histograms:
             raise ArgumentError(f"channel = {channel!r}: {path} holds frames, whose channel was chosen when drawn")
         file = FramesFile.load(path)
         return Histograms(
-            values=file.counts(),
-            bin_width=file.bin_width,
-            gate_start=file.gate_start,
-            background=file.background * np.float32(file.pulses),
+            values=file.counts(), bin_width=file.bin_width, gate_start=file.gate_start, scene=file.scene, irf=file.irf,
+            response=file.irf, background=file.background * np.float32(file.pulses),
             pulses=file.pulses if file.scene.detector.mode == "first_photon" else 0,
-            irf=file.irf,
-            response=file.irf,
-            scene=file.scene,
-        )
+        )  # fmt: skip
     result = analyser_channel(load_result(path), channel)
     scene = result.scene
     return Histograms(
-        values=result.expected(),
-        notes=tuple(filter(None, [noise_problem(result)])),
-        bin_width=scene.gate.bin_width,
-        gate_start=scene.gate.start,
+        values=result.expected(), bin_width=scene.gate.bin_width, gate_start=scene.gate.start, scene=scene,
+        response=detector_response(scene.detector, scene.laser), notes=tuple(filter(None, [noise_problem(result)])),
         background=result.expected("backscatter").astype(np.float32),
-        response=detector_response(scene.detector, scene.laser),
-        scene=scene,
-    )
+    )  # fmt: skip
 
 
 def _checked(values: NDArray[Any], path: Path) -> NDArray[Any]:
@@ -237,15 +226,11 @@ def _ordered(values: NDArray[Any], axes: str | None) -> tuple[NDArray[Any], list
 
 def _inferred(shape: tuple[int, ...], orders: Sequence[str]) -> str | None:
     """Bins last or, before the image, first: the order whose image is clearly nearer to a square, if any."""
-    ratio = {}
-    for order in orders:
-        size = dict(zip(order, shape, strict=True))
-        if size["t"] >= _LEAST_BINS:
-            ratio[order] = max(size["y"], size["x"]) / max(min(size["y"], size["x"]), 1)
+    sizes = {order: dict(zip(order, shape, strict=True)) for order in orders}
+    usable = {order: size for order, size in sizes.items() if size["t"] >= _LEAST_BINS}
+    ratio = {order: max(size["y"] / size["x"], size["x"] / size["y"]) for order, size in usable.items()}
     best = sorted(ratio, key=lambda order: ratio[order])
-    if len(best) == 1 or (best and ratio[best[0]] * _CLEARLY <= ratio[best[1]]):
-        return best[0]
-    return None
+    return best[0] if len(best) == 1 or (best and ratio[best[0]] * _CLEARLY <= ratio[best[1]]) else None
 
 
 def _in_words(shape: tuple[int, ...], axes: str) -> str:
@@ -281,9 +266,8 @@ def _arrays(path: Path) -> Iterator[dict[str, Variable]]:
 
 def _listed(variables: Mapping[str, Variable]) -> str:
     kinds = {"dense": "", "sparse": " sparse", "cell": " cells"}
-    return (
-        ", ".join(f"{k or 'one without name'} {v.shape}{kinds[v.kind]}" for k, v in variables.items()) or "no numbers"
-    )
+    listed = (f"{name or 'one without name'} {one.shape}{kinds[one.kind]}" for name, one in variables.items())
+    return ", ".join(listed) or "no numbers"
 
 
 def _unnamed(path: Path, variables: Mapping[str, Variable]) -> ArgumentError:

@@ -55,11 +55,13 @@ def example_or_path(path: str | os.PathLike[str], kind: str) -> Path:
 
 def similar(path: str | os.PathLike[str]) -> str:
     """Addition to an error about a missing file, `; did you mean 'planned.toml'?`: one beside it, of that ending if
-    there are some, or that of its name in the current folder."""
+    there are some, or that of its name in the current folder; of a folder what it holds."""
     place = Path(path)
     if place.is_absolute() and Path(place.name).is_file():
         return f"; there is a {place.name} in the current folder: the paths in a file begin at that file's folder"
     try:
+        if os.path.isdir(place):
+            return f"; it is a folder, which holds {', '.join(sorted(os.listdir(place))[:6]) or 'nothing'}"
         beside = os.listdir(place.parent)
     except (OSError, ValueError):
         return ""
@@ -97,8 +99,6 @@ def existing_file(path: str | Path) -> Path:
     if (problem := file_problem(path)) is not None:
         scene = str(path) in examples("scenes")
         hint = f"; `spadwarp simulate {path} --out DIR` makes a result of this scene" if scene else similar(path)
-        if os.path.isdir(path):
-            hint = f"; it is a folder, which holds {', '.join(sorted(os.listdir(path))[:6]) or 'nothing'}"
         raise FileError(f"{path}: {problem}{hint}")
     return Path(path)
 

@@ -411,7 +411,7 @@ def in_field_unit(value: Any, info: FieldInfo) -> Any:
             except ValueError as error:
                 raise ValueError(f"holds {item!r}, which {error}") from None
         return type(value)(numbers)
-    if isinstance(value, Mapping) and any(getattr(part, "numeric", False) for part in parts_of(info.annotation)):
+    if isinstance(value, Mapping):
         return {name: in_field_unit(item, info) for name, item in value.items()}
     unit = field_unit(info) if isinstance(value, str) and _NUMBER.match(value) else None
     if unit is None:

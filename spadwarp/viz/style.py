@@ -403,8 +403,8 @@ class Panels:
         self, image: NDArray[Any], title: str, limits: tuple[float, float], label: str = LABELS["depth"]
     ) -> Axes:
         """Depth [m]; the label says what is grey."""
-        label += "\ngrey: no depth" * bool(np.isnan(image).any() and np.isfinite(image).any())
-        return self.show(image, title, label, DEPTH_MAP, limits)
+        grey = "\ngrey: no depth" * bool(np.isnan(image).any() and np.isfinite(image).any())
+        return self.show(image, title, label + grey, DEPTH_MAP, limits)
 
     def show_error(self, error: NDArray[Any], title: str) -> None:
         """Signed depth errors [m]; see `error_limit`. How many pixels are beyond the colours is written below."""
@@ -471,10 +471,9 @@ def shown_limits(
         each = weights[known].astype(np.float64)
         for _ in range(3 * bool(beyond)):
             each = np.minimum(each, 0.005 * beyond * each.sum())
-        ends = np.quantile(image[known], (beyond / 100, 1.0 - beyond / 100), weights=each, method="inverted_cdf")
+        low, high = np.percentile(image[known], (beyond, 100.0 - beyond), weights=each, method="inverted_cdf")
     else:
-        ends = np.percentile(image[known], (beyond, 100.0 - beyond)) if known.any() else np.array([0.0, 1.0])
-    low, high = ends
+        low, high = np.percentile(image[known], (beyond, 100.0 - beyond)) if known.any() else (0.0, 1.0)
     spare = max(0.0, 0.01 - (high - low)) / 2
     spare += margin * (high - low + 2 * spare)
     return float(low - spare), float(high + spare)
