@@ -2,6 +2,7 @@
 
 import json
 import re
+import sys
 
 import h5py
 import numpy as np
@@ -11,7 +12,7 @@ from scipy.io import savemat
 from helpers.cli import run
 from helpers.datasets import make, recipe
 from helpers.stepped_frames import noisy_frame, scene
-from spadwarp import ArgumentError, FileError
+from spadwarp import ArgumentError, FileError, SpadwarpError
 from spadwarp.dataset import FrameReader
 from spadwarp.denoise import denoise_file, files
 from spadwarp.denoise.files import read_depth
@@ -191,6 +192,12 @@ def test_what_cannot_be_read(tmp_path):
             read_depth(tmp_path / name)
     with pytest.raises(FileError, match="no file that ends in"):
         files.depth_files(tmp_path / "empty")
+
+
+def test_a_package_that_is_missing_is_named_before_anything_is_read(tmp_path, monkeypatch):
+    monkeypatch.setitem(sys.modules, "safetensors", None)
+    with pytest.raises(SpadwarpError, match="denoising needs safetensors: pip install"):
+        denoise_file(tmp_path / "none.npy", tmp_path / "out")
 
 
 def test_depths_below_zero_count_as_not_reported(tmp_path):
