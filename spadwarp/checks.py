@@ -42,7 +42,7 @@ from spadwarp.transport.spectrum import scenes_of_lines
 from spadwarp.values import ConfigError, guarded, path_from_time, quantity, range_from_time, time_from_path, with_prefix
 from spadwarp.water import group_index, molecular_density, pure_water_absorption
 
-__all__ = ["CheckMessage", "check", "summary"]
+__all__ = ["CheckMessage", "check", "implausible", "summary"]
 
 Points = NDArray[np.float64]
 
@@ -199,13 +199,11 @@ class Survey:
         collected = self.reflectance / math.pi * scene.camera.aperture_area / distance**2
         photons = ballistic * passed * through * collected * scene.laser.photons_per_pulse
         return OnAxis(
-            distance=distance,
-            optical_depth=optical_depth,
+            distance=distance, optical_depth=optical_depth,
             irradiance=axis_fluence(scene, distance) * passed * scene.laser.average_power,
-            samples_per_pixel=_photons(scene) / scene.scan_positions * ballistic,
-            photons_per_pixel=photons,
+            samples_per_pixel=_photons(scene) / scene.scan_positions * ballistic, photons_per_pixel=photons,
             signal_per_pulse=photons * scene.detections_per_photon,
-        )
+        )  # fmt: skip
 
 
 def check(scene: SceneLike, mesh: TriangleMesh | None = None, *, device: str | None = "cpu") -> list[CheckMessage]:
@@ -255,10 +253,8 @@ def summary(scene: SceneLike, mesh: TriangleMesh | None = None) -> dict[str, Any
     None for a pinhole. `optical_depth` is one-way to the nearest visible point. `signal_per_pulse` is the expected
     number of unscattered target photons that one pixel on the beam's axis detects from a pulse, `photons_per_pixel` how
     many it receives; `samples_per_pixel` how many of the traced photons reach a pixel's part of the target unscattered,
-    None where their number is "auto".
-    `irradiance` is that of unscattered light at the nearest visible point's range on the beam's axis, mean over time
-    [W/m²]. `histogram_bytes` is one set of tallies.
-    Raises `MeshError`.
+    None where their number is "auto". `irradiance` is that of unscattered light at the nearest visible point's range on
+    the beam's axis, mean over time [W/m²]. `histogram_bytes` is one set of tallies. Raises `MeshError`.
     """
     scene = as_scene(scene)
     survey = Survey(scene, mesh)
@@ -274,8 +270,7 @@ def summary(scene: SceneLike, mesh: TriangleMesh | None = None) -> dict[str, Any
         **waters[0],
         "layers": [{"start": layer.start, **water} for layer, water in zip(medium.layers, waters[1:], strict=True)],
         "grid": _grid_summary(scene),
-        "target_range": survey.target_range,
-        "target_arrival_ns": survey.target_arrival_ns,
+        **{name: getattr(survey, name) for name in ("target_range", "target_arrival_ns")},
         **axis,
         "optical_depth": survey.optical_depth,
         "gate_range": (survey.range_of(gate.start), survey.range_of(gate.stop)),
@@ -283,8 +278,7 @@ def summary(scene: SceneLike, mesh: TriangleMesh | None = None) -> dict[str, Any
         "path_limit": scene.path_limit,
         "unambiguous_range": survey.range_of(1.0 / laser.repetition_rate),
         "irf_fwhm_ps": survey.irf_fwhm_ps,
-        "horizontal_fov_deg": math.degrees(camera.horizontal_fov),
-        "vertical_fov_deg": math.degrees(camera.vertical_fov),
+        **{f"{one}_fov_deg": math.degrees(getattr(camera, f"{one}_fov")) for one in ("horizontal", "vertical")},
         "aperture_area": camera.aperture_area,
         "focus_distance": survey.focus_distance,
         **{name: getattr(laser, name) for name in ("photons_per_pulse", "average_power", "peak_power")},
@@ -296,50 +290,65 @@ def summary(scene: SceneLike, mesh: TriangleMesh | None = None) -> dict[str, Any
 # Values that are valid but far from what a SPAD camera, its laser, water and targets have: mostly a wrong unit
 
 _PLAUSIBLE = tomllib.loads((files("spadwarp") / "plausible.toml").read_text(encoding="utf-8"))
+_FRESH, _SEA = WATER_INDICES["fresh"][1], WATER_INDICES["seawater"][1]
 _MOST_POWER = 100.0  # [W]
 _FARTHEST = 1000.0  # [m] of a laser, a camera or a target
 _MESH_SIDES = (0.01, 100.0)  # longest side of a mesh file's target [m]
 
 
-def _check_plausible(survey: Survey) -> None:
-    """Values of the scene outside what is plausible, with the unit that was probably meant."""
-    scene, laser = survey.scene, survey.scene.laser
-    aloft = ("horizontal_fov_deg", "half_angle_deg", "start_ns")[: 3 if scene.surface else int(bool(survey.moving))]
+def implausible(scene: SceneLike) -> list[CheckMessage]:
+    """Warnings that need no ray: values that are not plausible, with the unit that was probably meant, or not used."""
+    scene, found = as_scene(scene), list[CheckMessage]()
+    laser, detector, medium = scene.laser, scene.detector, scene.medium
+    aloft = ["horizontal_fov_deg", "half_angle_deg", "start_ns"]
+    del aloft[3 if scene.surface else int(scene.scan.mode == "trajectory") :]
     ports = {"camera.port": scene.camera.port, "laser.port": laser.port}
     ports = {name: port for name, port in ports.items() if isinstance(port, Port) and port.thickness > 0.0}
     for section, fields in _PLAUSIBLE.items():
         for place, model in (ports if section == "port" else {section: getattr(scene, section)}).items():
             for name in (field for field in fields if field not in aloft):
-                _check_value(survey, f"{place}.{name}", model, *fields[name])
-    if laser.average_power > _MOST_POWER and not any(item.field.startswith("laser.") for item in survey.messages):
+                found += _doubts(f"{place}.{name}", model, *fields[name])
+    if laser.average_power > _MOST_POWER and not any(item.field.startswith("laser.") for item in found):
         energy, rate = with_prefix(laser.pulse_energy, "J"), with_prefix(laser.repetition_rate, "Hz")
         text = f"{energy} at {rate} are {with_prefix(laser.average_power, 'W')} on average"
-        survey.warn("laser.pulse_energy", text, average_power=laser.average_power)
+        found.append(CheckMessage("warning", "laser.pulse_energy", text, {"average_power": laser.average_power}))
     places = {"laser.position": laser.position, "camera.position": scene.camera.position}
     places |= {f"targets[{i}].translation": target.translation for i, target in enumerate(scene.targets)}
     for name, point in places.items() if scene.surface is None else ():
         if (farthest := max(map(abs, point))) > _FARTHEST:
             text = f"{list(point)} m is {farthest:.4g} m away; in mm it would be {[1e-3 * x for x in point]} m"
-            survey.warn(name, text, farthest=farthest)
-    for index, (target, triangles) in enumerate(zip(scene.targets, survey.targets, strict=True)):
-        if target.mesh is not None and len(triangles):
-            _check_mesh(survey, f"targets[{index}].scale", target.scale, np.ptp(triangles.reshape(-1, 3), axis=0))
+            found.append(CheckMessage("warning", name, text, {"farthest": farthest}))
+    if medium.group_index < min(medium.phase_index, 1.32):
+        text = f"group_index = {medium.group_index:g} is below phase_index = {medium.phase_index:g}; {_SEA} in the sea"
+        found.append(CheckMessage("warning", "medium.group_index", text))
+    for name in ("dead_time_ns", "afterpulsing_probability") if detector.mode == "first_photon" else ():
+        if value := getattr(detector, name):
+            text = f"{value:g} is not used: it goes with detector.mode = 'free_running'"
+            found.append(CheckMessage("warning", f"detector.{name}", text))
+    return found
 
 
-def _check_value(survey: Survey, field: str, model: Any, low: float, high: float, *units: str) -> None:
+def _doubts(field: str, model: Any, low: float, high: float, *units: str) -> list[CheckMessage]:
     name = field.rpartition(".")[2]
     value = getattr(model, name)
     if not isinstance(value, float) or value == 0.0 or low <= value <= high:
-        return
+        return []
     unit_of_field = field_unit(type(model).model_fields[name]) or "1"
     unit = "" if unit_of_field == "1" else f" {unit_of_field}"
     text = f"{value:g}{unit} is not plausible ({low:g} to {high:g}{unit} is)"
     meant = {other: quantity(f"{value!r} {other}", unit_of_field) for other in units}
     meant = {other: number for other, number in meant.items() if low <= number <= high}
-    if meant:
-        words = [f'"{value:g} {other}" ({number:g}{unit})' for other, number in meant.items()]
-        text += f"; did you mean {' or '.join(words)}?"
-    survey.warn(field, text, value=value, **{f"in_{other}": number for other, number in meant.items()})
+    words = [f'"{value:g} {other}" ({number:g}{unit})' for other, number in meant.items()]
+    text += f"; did you mean {' or '.join(words)}?" if words else ""
+    return [CheckMessage("warning", field, text, {"value": value} | {f"in_{one}": meant[one] for one in meant})]
+
+
+def _check_plausible(survey: Survey) -> None:
+    """What is implausible, and the size of meshes."""
+    survey.messages += implausible(survey.moving or survey.scene)
+    for index, (target, triangles) in enumerate(zip(survey.scene.targets, survey.targets, strict=True)):
+        if target.mesh is not None and len(triangles):
+            _check_mesh(survey, f"targets[{index}].scale", target.scale, np.ptp(triangles.reshape(-1, 3), axis=0))
 
 
 def _check_mesh(survey: Survey, field: str, scales: tuple[float, ...], extent: Points) -> None:
@@ -370,10 +379,7 @@ def _check_targets(survey: Survey) -> None:
             _check_target(survey, f"targets[{index}]", triangles)
     for index, target in enumerate(scene.targets):
         if target.specular > 0.0:
-            text = (
-                f"specular = {target.specular:g} acts in `simulate` alone: the analytic simulator, budgets and the "
-                "signal named here take the target as Lambertian"
-            )
+            text = f"specular = {target.specular:g} acts in `simulate` alone; all else takes the target as Lambertian"
             survey.note(f"targets[{index}].specular", text, specular=target.specular)
     (low, high), laser = scene.domain.bounds, to_world(scene.camera, scene.beam.position)
     for name, point in (("the lens", scene.camera.position), ("the laser", laser)):
@@ -414,10 +420,8 @@ def _check_target(survey: Survey, name: str, triangles: Points) -> None:
     if laser.profile in ("uniform_cone", "gaussian") and scene.scan_positions == 1 and laser.half_angle_deg < 90.0:
         widest = math.degrees(float(_angles(survey.visible(in_view), laser).max()))
         if math.tan(math.radians(min(widest, 89.9))) > 2.0 * math.tan(laser.half_angle):
-            text = (
-                f"the beam misses most of what the camera sees of it: that reaches {widest:.3g}° off the axis, "
-                f"{_beam_text(scene.laser)}"
-            )
+            text = f"the beam misses most of what the camera sees of it: that reaches {widest:.3g}° off the axis, "
+            text += f"{_beam_text(scene.laser)}"
             survey.note("laser.half_angle_deg", text, widest_angle_deg=widest)
     illuminated = survey.visible(illuminated)
     _check_gate(survey, name, survey.paths(illuminated))
@@ -493,10 +497,8 @@ def _check_focus(survey: Survey) -> None:
 
     worst = max(survey.target_range, key=blur)
     if (pixels := blur(worst)) > 1.0:
-        text = (
-            f"a point at {worst:.4g} m is blurred over {pixels:.3g} pixels by a lens focused at "
-            f"{focus:.4g} m; truth maps and the analytic simulator are sharp"
-        )
+        text = f"a point at {worst:.4g} m is blurred over {pixels:.3g} pixels by a lens focused at "
+        text += f"{focus:.4g} m; truth maps and the analytic simulator are sharp"
         survey.note("camera.focus_distance", text, distance=worst, pixels=pixels)
 
 
@@ -576,7 +578,6 @@ def _check_shots(survey: Survey) -> None:
 
 # The light: time of flight, spectrum, daylight, polarisation, and whether enough photons come back
 
-_FRESH, _SEA = WATER_INDICES["fresh"][1], WATER_INDICES["seawater"][1]
 _MEMORY_LIMIT = 2 * 2**30  # [bytes] of one set of tallies, from which on it is mentioned
 
 
@@ -596,20 +597,16 @@ def _check_timing(survey: Survey) -> None:
         text = f"the gate of {length:.5g} ns is longer than the pulse period, {period:.5g} ns: time wraps within it"
         survey.note("gate.bins", text, gate_ns=length, period_ns=period)
     if gate.bin_width_ps > survey.irf_fwhm_ps:
-        text = (
-            f"bin_width_ps = {gate.bin_width_ps:.4g} is coarser than the instrument response, "
-            f"{survey.irf_fwhm_ps:.4g} ps: depth is resolved to {survey.bin_range:.3g} m"
-        )
+        text = f"bin_width_ps = {gate.bin_width_ps:.4g} is coarser than the instrument response, "
+        text += f"{survey.irf_fwhm_ps:.4g} ps: depth is resolved to {survey.bin_range:.3g} m"
         survey.note("gate.bin_width_ps", text, irf_fwhm_ps=survey.irf_fwhm_ps)
     medium, index = survey.scene.medium, survey.scene.medium.group_index
     distance = survey.target_range[0] if survey.target_range else survey.range_of(gate.stop)
     if index in (_FRESH, _SEA) and abs(laser.wavelength_nm - 532.0) > 10.0 and laser.is_visible:
         true = group_index(laser.wavelength_nm, salinity=35.0 * (index == _SEA))
         error = distance * (true / index - 1.0)
-        text = (
-            f"{index} is for 532 nm; at the laser's {laser.wavelength_nm:g} nm it is {true:.4f}: {error:.3f} m at "
-            f"{distance:.3g} m; medium.temperature takes it from the laser"
-        )
+        text = f"{index} is for 532 nm; at the laser's {laser.wavelength_nm:g} nm it is {true:.4f}: {error:.3f} m at "
+        text += f"{distance:.3g} m; medium.temperature takes it from the laser"
         survey.warn("medium.group_index", text, group_index=true, error=error)
     elif "group_index" not in medium.model_fields_set and not medium.follows_wavelength:
         survey.note("medium.group_index", f"not given: {index}, seawater at 532 nm, is used for the time of flight")
@@ -627,6 +624,10 @@ def _check_spectrum(survey: Survey) -> None:
     scene, laser, detector = survey.scene, survey.scene.laser, survey.scene.detector
     lines = spectral_lines(laser, detector)
     passed = math.fsum(line.share for line in lines)
+    middle = math.fsum(line.share * line.wavelength_nm for line in lines) / passed if passed else laser.wavelength_nm
+    if laser.spectrum is not None and abs(middle - laser.wavelength_nm) > 20.0:
+        text = f"{laser.wavelength_nm:g} nm is that of photons and water, and the spectrum lies about {middle:.4g} nm"
+        survey.warn("laser.wavelength_nm", text, middle=middle)
     if detector.has_filter and passed < 0.2:
         field = "filter_fwhm_nm" if detector.filter_table is None else "filter_table"
         text = f"the filter passes {100.0 * passed:.3g} % of the laser's light, which is at {laser.wavelength_nm:g} nm"
@@ -654,10 +655,8 @@ def _check_spectrum(survey: Survey) -> None:
     variance = math.fsum(w * (1.0 / line.speed - mean) ** 2 for w, line in zip(weights, waters, strict=True)) / total
     spread_ps = 2.0 * math.sqrt(2.0 * math.log(2.0)) * math.sqrt(variance) * path * 1e12
     if spread_ps > 0.3 * survey.irf_fwhm_ps:
-        text = (
-            f"dispersion spreads the target's light over {spread_ps:.3g} ps, and the response has "
-            f"{survey.irf_fwhm_ps:.3g} ps: set pulse_fwhm_ps to both, the spread is left out"
-        )
+        text = f"dispersion spreads the target's light over {spread_ps:.3g} ps, and the response has "
+        text += f"{survey.irf_fwhm_ps:.3g} ps: set pulse_fwhm_ps to both, the spread is left out"
         survey.note(field, text, spread_ps=spread_ps)
 
 
@@ -731,10 +730,8 @@ def _check_statistics(survey: Survey) -> None:
     if axis is None:
         return
     signal, samples, traced = axis.signal_per_pulse, axis.samples_per_pixel, _photons(scene)
-    text = (
-        f"optical depth to the nearest illuminated point {axis.optical_depth:.3g} one way ({axis.distance:.4g} m); "
-        f"a pixel on the beam's axis detects {signal:.3g} unscattered photons a pulse"
-    )
+    text = f"optical depth to the nearest illuminated point {axis.optical_depth:.3g} one way ({axis.distance:.4g} m); "
+    text += f"a pixel on the beam's axis detects {signal:.3g} unscattered photons a pulse"
     survey.note("medium.extinction", text, optical_depth=axis.optical_depth, signal_per_pulse=signal)
     if signal > 0.05:
         text = f"{signal:.3g} target detections per pulse and pixel: first-photon counting piles up"
@@ -806,10 +803,8 @@ def _check_phase_table(survey: Survey) -> None:
         survey.warn("transport.axis_threshold", text, within=within)
     continued = law.fraction_below(law.first_angle) if law.first_angle > 0.0 else 0.0
     if continued > 0.1:
-        text = (
-            f"begins at {math.degrees(law.first_angle):.3g}°: {100.0 * continued:.2g} % of the scattered light is "
-            "below that, where the law between the first two points is continued"
-        )
+        text = f"begins at {math.degrees(law.first_angle):.3g}°: {100.0 * continued:.2g} % of the scattered light is "
+        text += "below that, where the law between the first two points is continued"
         survey.note("medium.phase_table", text, continued=continued)
 
 

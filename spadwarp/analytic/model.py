@@ -331,8 +331,7 @@ def passed_by_grid(scene: Scene, views: Floats, distances: Floats) -> Floats:
 
 
 def _begin_of_light(scene: Scene, sights: LinesOfSight, points: Floats) -> Floats:
-    """Where the laser's light to points `[P, 3]` enters the water, or is emitted in it [m]; NaN where there is no
-    way."""
+    """Where the laser's light to points `[P, 3]` enters the water, or is emitted in it [m]; NaN without a way."""
     beam, port = scene.beam, laser_port(scene)
     laser, axis = np.array(beam.position), np.array(beam.axis)
     if beam.profile != "collimated":

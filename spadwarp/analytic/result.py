@@ -252,9 +252,10 @@ def simulate_analytic(
         device=device,
         backscatter_profile=_profile(scene, backscatter_profile),
     )
-    illuminated = maps["signal"] > 0
-    if illuminated.any() and not (maps["fisher"] > 0).any():
-        times = maps["arrival"][illuminated] * 1e9
+    illuminated, arrival = maps["signal"] > 0, 1e9 * maps["arrival"]
+    times = arrival[illuminated] if illuminated.any() else arrival[np.isfinite(arrival)]
+    within = (times >= 1e9 * scene.gate.start) & (times < 1e9 * scene.gate.stop)
+    if times.size and not (maps["fisher"] > 0).any() and (illuminated.any() or not within.any()):
         raise ConfigError(
             f"gate [{scene.gate.start * 1e9:.4g}, {scene.gate.stop * 1e9:.4g}) ns holds no return; "
             f"the target's arrive from {times.min():.4g} to {times.max():.4g} ns",

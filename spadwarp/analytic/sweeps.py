@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import itertools
 import math
+import re
 import warnings
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
@@ -127,16 +128,13 @@ def _plan_row(scene: Scene, options: dict[str, Any]) -> PlanRow:
     known = math.inf if found.pulses_for in ("floor", "out of reach") else told
     least, most = (known * pulses for pulses in found.pulses_range)
     return PlanRow(
-        pulses=known * found.pulses,
-        pulses_least=least,
-        pulses_most=most,
-        frame_time=known * found.frame_time,
+        pulses=known * found.pulses, pulses_least=least, pulses_most=most, frame_time=known * found.frame_time,
         pulse_energy=found.scene.laser.pulse_energy,
         sigma_depth=told * found.pilot.bound / math.sqrt(scene.pulses_per_depth_frame),
         floor=told * math.hypot(found.pilot.floor[found.method], found.pilot.pile_up[found.method]),
         largest_range=found.largest_range if found.unjudged_ranges is None else math.nan,
         limit=found.limit if found.judged else "not judged: more photons",
-    )
+    )  # fmt: skip
 
 
 # Values to vary
@@ -156,6 +154,8 @@ def combinations(scene: SceneLike, vary: Any, *, planned: bool) -> tuple[tuple[s
             raise ArgumentError(f"vary = {shown(one)} is neither 'section.field=from:to:count' nor (field, values)")
     check_integer("number of values to vary", math.prod(len(values) for _, values in curves), f"[1, {LONGEST}]")
     fields = tuple(field for field, _ in curves)
+    if twice := [field for field in fields if fields.count(field) > 1]:
+        raise ArgumentError(f"vary: {twice[0]} is there twice; one list takes all of its values")
     if not planned and (own := [field for field in fields if field in ("range", _ANALYSER)]):
         text = "is no field of a budget: of = 'plan' varies it with others; `spadwarp.budget` is over range alone"
         raise ArgumentError(f"vary: {own[0]} {text}")
@@ -203,8 +203,8 @@ def parse_vary(text: str) -> tuple[str, list[Any]]:
         raise ArgumentError(f"vary = {shown(text)} is not of the form section.field=from:to:count")
     info = locate(Scene, parse_key(field))[1]
     unit = "m" if field == "range" else field_unit(info) if info is not None else None
-    lengths = [part.strip() for part in (spec.split(":")[:2] if ":" in spec else spec.split(","))]
-    if field == "range" and len({part[-1:] in "0123456789." for part in lengths}) > 1:
+    lengths = re.findall(r"(?:^|[:,])\s*[-+.]?\d[^:,]*", spec)[: 2 if ":" in spec else None]
+    if field == "range" and len({part.strip()[-1] in "0123456789." for part in lengths}) > 1:
         raise ArgumentError(f"vary: range = {shown(spec)} is ambiguous: write the unit of all lengths, or of none")
     values = parse_values(spec, unit, name=f"vary: {field}")
     if ":" in spec and info is not None and takes_integers(info):

@@ -29,7 +29,7 @@ FAILED, WRONG_USE, BUG, INTERRUPTED = 1, 2, 70, 130
 
 @dataclass
 class Running:
-    """The command that runs: its common options, and the names of all that have another value than by default."""
+    """The command that runs: its common options, and the names of all that are given."""
 
     quiet: bool = False
     prints_result: bool = False  # also with --quiet
@@ -165,13 +165,9 @@ def fail(text: str, code: int = FAILED) -> NoReturn:
 
 # Help in plain text: units in square brackets stay, and nothing is loaded to draw boxes.
 app = typer.Typer(
-    cls=_Commands,
-    no_args_is_help=True,
-    add_completion=True,
-    pretty_exceptions_enable=False,
-    rich_markup_mode=None,
+    cls=_Commands, no_args_is_help=True, add_completion=True, pretty_exceptions_enable=False, rich_markup_mode=None,
     context_settings={"help_option_names": ["-h", "--help"]},
-)
+)  # fmt: skip
 
 
 def _version(asked: bool) -> None:

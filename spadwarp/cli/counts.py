@@ -74,6 +74,8 @@ def detect(
     counted = min(shots, bins) if scene.detector.mode == "first_photon" else bins
     needed = max(frames, 0) * scene.camera.width * scene.camera.height * (4 * counted + 4 * len(methods) + 8)
     check_outputs(out, ("frames.h5", "frame.png"), inputs=(run,), needed=needed + (16 << 20))
+    if overrides:
+        opt.warn_of(scene)
     options: dict[str, Any] = {"pulses": pulses, "frames": frames, "seed": seed, "methods": methods, "tags": tags}
     options |= {"undo_pile_up": coates, "window": recorded, "device": device, "progress": progress("frames")}
     recording = spadwarp.frames.record_frames(result, out / "frames.h5", **options)
@@ -299,6 +301,7 @@ def fit(
     read, (facts, files) = opt.read_scene(scene, overrides), opt.read_measured(inputs)
     names = spadwarp.files.fit_files(spadwarp.inverse.read_unknowns(read, unknown))
     check_outputs(out, names, inputs=(path, scene, *files, *read.files))
+    opt.warn_of(read)
     found = spadwarp.fit(
         spadwarp.files.locate(path), read, initial_guess=start, progress=progress(), **options, **facts
     )

@@ -155,12 +155,13 @@ def evaluate(
     run: Any = evaluation.evaluate_scenes
     show: Any = _show_scenes
     write: Any = evaluation.write_scene_report
-    if fresh is not None or data is None:
+    of_run = data is not None and (data.is_file() or (data / "result.h5").is_file())
+    if fresh is not None or data is None or of_run:
         opt.refuse("is for a dataset", "--split", "--frames", "--bm3d-frames", "--crop")
     if fresh is not None:
         opt.refuse("cannot be combined with --fresh, which makes scenes of its own", "DATA", "--models", "--report")
         run, show, write, options = evaluation.evaluate_fresh, _show_fresh, None, {"scenes": fresh, "seed": seed}
-    elif data is not None and (data.is_file() or (data / "result.h5").is_file()):
+    elif data is not None and of_run:
         if problem := spadwarp.result.noise_problem(result := opt.load_run(data)):
             complain(problem, "warning")  # it counts as light here
         run, show = partial(evaluation.photon_sweep, result), _show_photons

@@ -17,7 +17,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal, Union, get_args, get_
 import typer
 
 import spadwarp
-from spadwarp.cli.app import app, running, wrong
+from spadwarp.cli.app import app, complain, running, wrong
 from spadwarp.values import parse_number, quantity, shown, suggestion
 
 if TYPE_CHECKING:
@@ -55,17 +55,18 @@ def command(*, name: str | None = None, prints_result: bool = False) -> Callable
             long = shared.get("option", "--" + one.name.rstrip("_").replace("_", "-"))
             names[one.name] = long if one.kind is inspect.Parameter.KEYWORD_ONLY else metavar.strip("[]")
             made.append(_parameter(one, hints[one.name], metavar, about, names[one.name]))
-        defaults = {one.name: one.default for one in made}
 
-        def run(**values: Any) -> None:
+        def run(context: typer.Context, **values: Any) -> None:
             for common in _COMMON:
                 setattr(running, common, values.pop(common, None))
             running.prints_result = prints_result
-            running.given = frozenset(names[one] for one, value in values.items() if value != defaults[one])
+            source = context.get_parameter_source
+            running.given = frozenset(names[one] for one in values if getattr(source(one), "name", "") != "DEFAULT")
             function(**{one: _plain(value) for one, value in values.items()})
 
         run.__doc__ = text
-        vars(run)["__signature__"] = inspect.Signature(made)
+        here = inspect.Parameter("context", inspect.Parameter.KEYWORD_ONLY, annotation=typer.Context)
+        vars(run)["__signature__"] = inspect.Signature([here, *made])
         app.command(name or function.__name__)(run)
         return function
 
@@ -305,6 +306,12 @@ def read_scene(
         replaced = {"targets[0]": {"mesh": str(mesh), "scale": None, "subdivisions": None}}
         scene = spadwarp.load_scene(path, replaced).with_overrides(overrides or [])
     return scene.with_overrides(transport=given(photons=photons, seed=seed))
+
+
+def warn_of(scene: Scene) -> None:
+    """Shows what is implausible in a scene that its command does not check."""
+    for message in spadwarp.checks.implausible(scene):
+        complain(str(message))
 
 
 def load_run(place: Path, channel: Channel = "I") -> Result:

@@ -268,6 +268,7 @@ def sweep(
     draw: Any
     if of_range:
         values = spadwarp.analytic.parse_vary(texts[0])[1] if vary else None
+        opt.warn_of(read)
         lines = found = spadwarp.budget(read, values, medium or None, reflectance=reflectance, device=device)
         keys, draw = [{"water": row.medium} for row in found], spadwarp.viz.draw_budget
     else:

@@ -436,6 +436,7 @@ def analytic(
     check_outputs(out, ("analytic.h5", "analytic.png"), inputs=inputs, needed=needed)
     if frames < 0:
         raise ArgumentError(f"frames = {frames} is outside [0, inf)")
+    opt.warn_of(read)
     result = spadwarp.simulate_analytic(
         read,
         truth=spadwarp.result.load_truth_exr(camera=read.camera, **maps) if maps else None,

@@ -135,8 +135,7 @@ def repaired(counts: NDArray[Any], found: Defects) -> NDArray[Any]:
 def _wrong(
     counts: NDArray[Any], expected: NDArray[np.float64], shape: NDArray[np.float64], most: float, width: int
 ) -> NDArray[np.bool_]:
-    """Which of the histograms `[..., T]` are stuck, dead or hot; `expected`: background of each, over the bins of
-    this `shape`."""
+    """Which histograms `[..., T]` are stuck, dead or hot; `expected`: background of each, over bins of this `shape`."""
     from scipy.ndimage import median_filter
 
     total = counts.sum(axis=-1, dtype=np.int64)

@@ -25,7 +25,7 @@ from spadwarp.denoise.network_files import Precision, require_torch, weights_met
 from spadwarp.denoise.recipe import TrainingRecipe, load_training_recipe
 from spadwarp.files import Held, gate_of, holds_own_file, is_own_file, load, locate, sequence, stored_depth
 from spadwarp.frames.backgrounds import BackgroundLaw, profile_of_depth
-from spadwarp.frames.depth import Method, Quantity, depth_of, geometry
+from spadwarp.frames.depth import FARTHEST, Method, Quantity, depth_of, geometry
 from spadwarp.frames.file import SequenceFile
 from spadwarp.frames.measured import Histograms, read_histograms, stored_images
 from spadwarp.io.arrays import read_exr, write_exr
@@ -34,7 +34,7 @@ from spadwarp.result import Result
 from spadwarp.scene.sections import file_of
 from spadwarp.scene.sight import depth_from_time
 from spadwarp.transport import PhotonRecords
-from spadwarp.values import ArgumentError, FileError, check_real, percent, range_from_time
+from spadwarp.values import ArgumentError, FileError, SpadwarpWarning, check_real, percent, range_from_time
 from spadwarp.viz import draw_denoised, draw_learning_curves
 
 __all__ = ["denoise_file", "depth_files", "read_depth", "train"]
@@ -133,6 +133,9 @@ def read_depth(
         below = np.count_nonzero(depth < 0)
         depth[~np.isfinite(depth) | (depth >= 65504.0) | (depth <= 0)] = np.nan  # 65504: the sky in float16
         frames = depth.reshape(-1, *depth.shape[-2:]) * np.float32(scale)
+        if np.isfinite(frames).any() and (middle := float(np.nanmedian(frames))) > FARTHEST:
+            text = f"{place}: depths of {middle:.4g} m; no light comes back so far through water: scale = {scale:g} m"
+            warnings.warn(f"{text}, per unit of the file, or gate may be wrong", SpadwarpWarning, stacklevel=2)
         source = "depth as it is" + (f": {chosen}" if chosen else "")
         source += f"; {below} values below 0 count as not reported" if below else ""
         return DepthReading(depth=frames, frames=depth.ndim == 3, gate=None, profile=None, source=source)
@@ -214,7 +217,8 @@ def _estimate_depth(histograms: Histograms, counted: bool, method: Method | None
     method = method or ("likelihood" if counted else "matched")
     if method in ("matched", "likelihood") and histograms.response is None:
         method = "centroid"
-    reduced = depth_of(histograms, method=method, min_significance=0.0, device=device)
+    # Of counts whose response is unknown, only what is significant: the networks know no noise of open water as even.
+    reduced = depth_of(histograms, method=method, min_significance=0.0 if counted else None, device=device)
     scene = histograms.scene
     index = scene.medium.group_index if scene is not None else float(histograms.group_index or 1.0)
     gate_stop = histograms.gate_start + histograms.values.shape[-1] * float(histograms.bin_width or 0.0)

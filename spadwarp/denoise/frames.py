@@ -232,8 +232,7 @@ def gates_of_target(depth: Tensor, density: Tensor) -> tuple[Tensor, Tensor, Ten
 
 
 def narrowed_input(depth: Tensor, density: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-    """Input of PyramidNet `[N, 3, H, W]` over `gates_of_target`, beyond whose `MARGIN` nothing counts as reported, and
-    what that gives."""
+    """Input of PyramidNet `[N, 3, H, W]` over `gates_of_target`, without what is beyond their `MARGIN`; its output."""
     import torch
 
     start, width, part = gates_of_target(depth, density)

@@ -118,8 +118,7 @@ def information_from_histogram(
 def _information_of_noise(
     noise: Map, total: Map, taps: Map, slope_taps: Map, law: str, *, is_variance: bool = False
 ) -> Map:
-    """Noise in the mean of the Fisher information per pulse, in 1/bins²: noise of the bins, or the variance
-    of bins that are independent."""
+    """Noise in the mean Fisher information per pulse, in 1/bins²: of the bins, or the variance of independent ones."""
     from scipy.ndimage import convolve1d
 
     added, size = np.empty(len(total)), max(1, _PART_VOXELS // total.shape[1])

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import warnings
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal
@@ -10,7 +11,7 @@ from typing import Any, Literal
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from spadwarp.arrays import histogram_rows, in_torch_order, is_torch, real_array, tensor_of
+from spadwarp.arrays import histogram_rows, in_torch_order, is_torch, on_host, real_array, tensor_of
 from spadwarp.frames.backgrounds import BackgroundLaw, estimate_background
 from spadwarp.frames.response import InstrumentResponse
 from spadwarp.result import Result
@@ -21,10 +22,12 @@ from spadwarp.values import (
     BIN_WIDTH,
     TIME,
     ArgumentError,
+    SpadwarpWarning,
     check_choice,
     check_integer,
     check_real,
     path_from_time,
+    range_from_time,
     shown,
 )
 
@@ -32,6 +35,8 @@ __all__ = ["METHODS", "Histograms", "Method", "Reduction", "arrival_time", "dept
 
 Method = Literal["peak", "centroid", "matched", "likelihood"]
 Quantity = Literal["depth", "range"]
+FARTHEST = 300.0  # from beyond which no light comes back through water [m]
+_PHASE_INDEX = (1.32, 1.35)  # of water; group indices are higher
 METHODS: tuple[Method, ...] = ("peak", "centroid", "matched", "likelihood")
 
 
@@ -233,7 +238,7 @@ class Reduction:
     method: str  # estimator of the arrival time, or "stored" for depth that was read
     camera: Camera | None = None  # that of a simulation, with its pose in the world; else None
     significance: NDArray[np.float32] | None = None  # of counts, float32 `[frames, H, W]`, see `spadwarp.arrival_time`
-    notes: tuple[str, ...] = ()  # how the background was estimated, in words
+    notes: tuple[str, ...] = ()  # what a measured file covers, and how the background was estimated, in words
 
     @property
     def frames(self) -> int:
@@ -291,6 +296,7 @@ def depth_of(
         raise ArgumentError("; ".join(text for text, value in missing.items() if value is None))
     index, lines = geometry(histograms, group_index, horizontal_fov_deg)
     counted = values.dtype.kind in "iu"
+    window = () if histograms.scene is not None else (_window(histograms, index),)
     notes: tuple[str, ...] = ()
     if isinstance(background, int | float):
         check_real("background", background, "[0, inf)")
@@ -310,15 +316,44 @@ def depth_of(
     options: dict[str, Any] = {"gate_start": histograms.gate_start, "bin_width": histograms.bin_width, "method": method}
     options |= {"level_known": level_known, "pulses": histograms.pulses, "min_significance": min_significance}
     time = arrival_time(values, irf=response, background=known, significance=significance, device=device, **options)
+    if known is not None and counted and histograms.scene is None:
+        _check_background(values, known)
     path = path_from_time(time.reshape(-1, height, width), index)
     distance = 0.5 * path if lines is None else lines.range_from_path(path)
     return Reduction(
-        quantity="range" if lines is None else "depth", range=distance, lines=lines, method=method, notes=notes,
-        values=distance if lines is None else lines.depth_from_range(distance),
-        intensity=values.sum(axis=-1).reshape(-1, height, width),
+        quantity="range" if lines is None else "depth",
+        values=distance if lines is None else lines.depth_from_range(distance), range=distance,
+        intensity=values.sum(axis=-1).reshape(-1, height, width), lines=lines, method=method,
         camera=None if histograms.scene is None else histograms.scene.camera,
-        significance=None if significance is None else significance.reshape(-1, height, width),
+        significance=None if significance is None else significance.reshape(-1, height, width), notes=(*notes, *window),
     )  # fmt: skip
+
+
+def _window(histograms: Histograms, index: float) -> str:
+    """A note on the ranges of a measured file; warns of those from which no light comes back through water."""
+    width, start = float(histograms.bin_width or 0.0), histograms.gate_start
+    near, far = (range_from_time(start + bins * width, index) for bins in (0, histograms.values.shape[-1]))
+    if index > _PHASE_INDEX[0] and not 0.0 < far <= FARTHEST:
+        text = f"{near:.4g} to {far:.4g} m: no light comes back through water: another unit of"
+        text += f" bin_width = {width * 1e12:g} ps or gate_start = {start * 1e9:g} ns?"
+        warnings.warn(text, SpadwarpWarning, stacklevel=3)
+    if _PHASE_INDEX[0] < index < _PHASE_INDEX[1]:
+        text = f"group_index = {index:g} is a phase index; for pulses it is 1.3566 in fresh water, 1.3638 in seawater"
+        warnings.warn(text, SpadwarpWarning, stacklevel=3)
+    return f"bins from {near:.4g} to {far:.4g} m"
+
+
+def _check_background(counts: NDArray[Any], background: ArrayLike) -> None:
+    """Warns of twice all counts, or half of those of the darker bins: a background of a pulse, or of all bins."""
+    cube, given = counts.reshape(-1, counts.shape[-1]), np.asarray(on_host(background), np.float64)
+    known = np.broadcast_to(given, (*given.shape[:-1], cube.shape[1])).reshape(-1, cube.shape[1]).mean(axis=0)
+    dark = np.argsort(seen := cube.mean(axis=0))[: len(known) // 2 + 1]
+    pairs = (known.sum(), seen.sum()), (seen[dark].sum(), known[dark].sum())
+    if known.any() and any(
+        more > 2.0 * less and more - less > 5.0 * math.sqrt(more / len(cube)) for more, less in pairs
+    ):
+        text = f"background: {known.sum():.3g} counts in a pixel do not explain its {seen.sum():.3g}"
+        warnings.warn(f"{text}; it is that of each bin in all pulses of a frame", SpadwarpWarning, stacklevel=3)
 
 
 def geometry(

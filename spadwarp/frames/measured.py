@@ -27,7 +27,7 @@ from spadwarp.io.mat import SparseMatrix, Variable, open_mat
 from spadwarp.io.paths import existing_file, reading
 from spadwarp.result import Channel, analyser_channel, noise_problem
 from spadwarp.result.file import load_result
-from spadwarp.values import ArgumentError, FileError, SpadwarpWarning, check_real, shown
+from spadwarp.values import ArgumentError, FileError, Interval, SpadwarpWarning, check_real, shown
 
 __all__ = ["read_histograms"]
 
@@ -40,6 +40,7 @@ _CLEARLY = 2.0  # as far from a square as the other order of axes, and the choic
 _LEAST_RESPONSE = 0.02  # bins: shorter ones are not used for timing
 _MOST_BINS = 1_000_000  # as of a scene's gate
 _MOST_VALUES = 1 << 29  # 2 GiB of counts
+_TIMES = {"tag_unit": "(0, 1e-3) s", "bin_width": "(0, 1e-3) s", "gate_start": "[-1, 1] s"}
 _MARKERS = 16  # of T3 records; four today
 # What ptufile says about a damaged file stands in our errors, too.
 logging.getLogger("ptufile").addHandler(logging.NullHandler())
@@ -98,11 +99,9 @@ def read_histograms(
         ArgumentError: A fact that is missing, out of range, or that the file holds itself.
     """
     path = existing_file(path)
-    for name, value, within in (("tag_unit", tag_unit, "(0, 1e-3) s"), ("bin_width", bin_width, "(0, 1e-3) s")):
+    for name, value in {"tag_unit": tag_unit, "bin_width": bin_width, "gate_start": gate_start}.items():
         if value is not None:
-            check_real(name, value, within)
-    if gate_start is not None:
-        check_real("gate_start", gate_start, "[-1, 1] s")
+            check_real(name, value, _TIMES[name])
     given: dict[str, Any] = {"dataset": dataset, "axes": axes, "image_size": image_size, "tag_unit": tag_unit}
     if is_own(path):
         given |= {"irf": irf, "bin_width": bin_width, "sum_frames": sum_frames, "gate_start": gate_start}
@@ -133,18 +132,21 @@ def read_histograms(
     if gate_start is None and raw.gate_start is None:
         origin = f"{'tag' if raw.first else 'bin'} 0 is taken for the time of the pulse"
         warnings.warn(f"{path.name}: gate start is not given (gate_start): {origin}", SpadwarpWarning, stacklevel=2)
-    bin_width = raw.bin_width if bin_width is None else bin_width
+    bin_width = _fact("bin_width", bin_width, raw.bin_width, path)
     if irf is not None and bin_width is not None:
         _check_response(irf, bin_width, values.shape[-1] * bin_width, path)
     return Histograms(
-        values=np.ascontiguousarray(values),
-        bin_width=bin_width,
-        gate_start=(gate_start if gate_start is not None else raw.gate_start or 0.0) + raw.first,
-        group_index=raw.group_index,
-        irf=irf,
-        response=irf,
-        notes=tuple(notes),
-    )
+        values=np.ascontiguousarray(values), bin_width=bin_width,
+        gate_start=(_fact("gate_start", gate_start, raw.gate_start, path) or 0.0) + raw.first,
+        group_index=raw.group_index, irf=irf, response=irf, notes=tuple(notes),
+    )  # fmt: skip
+
+
+def _fact(name: str, given: float | None, held: float | None, path: Path) -> float | None:
+    """What is given, or else in the file. Raises `ArgumentError` where that is out of range."""
+    if given is None and held is not None and held not in Interval.read(_TIMES[name]):
+        raise ArgumentError(f"{path}: {name} = {held:g} is outside {_TIMES[name]}; give it, such as {name}=55ps")
+    return held if given is None else given
 
 
 def _check_response(irf: InstrumentResponse, bin_width: float, length: float, path: Path) -> None:
@@ -316,17 +318,16 @@ def _read_arrays(
             needed = "tag_unit=8ps,bin_width=64ps,gate_start=0,group_index=1.3566,irf=300ps"
             raise ArgumentError(f"{path}: the unit of the time tags in {name} is missing (tag_unit); usual is {needed}")
         return _of_tags(value, tag_unit, bin_width, notes)
-    width = numbers.get("bin_size", numbers.get("bin_width", 0.0))
-    known = width if 1e-15 < width < 1e-3 else None
-    if bin_width is None and known is not None:
-        notes.append(f"bin width {known * 1e12:g} ps from the file")
-    start, index = numbers.get("gate_start", math.nan), numbers.get("group_index", 0.0)
+    width = numbers.get("bin_size", numbers.get("bin_width"))
+    if bin_width is None and width is not None:
+        notes.append(f"bin width {width * 1e12:g} ps from the file")
+    index = numbers.get("group_index", 0.0)
     is_sparse = isinstance(value, SparseMatrix)
     if is_sparse:
         value = _of_sparse(value, image_size, variables)
         notes.append(f"{value.shape[1]} x {value.shape[0]} pixels, column by column")
     options = ("dataset", "image_size" if is_sparse else "axes")[not name :]
-    facts = (known, start if abs(start) < 1e-2 else None, index if 1.0 <= index <= 3.0 else None)
+    facts = (width, numbers.get("gate_start"), index if 1.0 <= index <= 3.0 else None)
     return _Raw(value, tuple(notes), *facts, ordered=is_sparse, options=options)
 
 

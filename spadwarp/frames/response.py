@@ -214,8 +214,7 @@ def instrument_response(*, pulse_fwhm: float, jitter_fwhm: float, tail: float = 
 
 
 def detector_response(detector: Detector, laser: Laser | None = None) -> InstrumentResponse:
-    """The instrument response of a scene's detector and laser pulse; without a laser, of the detector alone. That of a
-    file is of both."""
+    """The instrument response of a scene's detector and laser pulse; that of a file is of both. No laser: no pulse."""
     if detector.irf.lower().endswith(".csv"):
         return read_response(detector.irf)
     return instrument_response(

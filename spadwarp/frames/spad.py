@@ -148,13 +148,9 @@ class Receiver:
             rates = noise.numpy() + np.broadcast_to(values, shape[:2]).reshape(-1)
             noise = wp.array(rates.astype(np.float32), dtype=wp.float32, device=noise.device)
         matrix = response_matrix(
-            detector_response(detector, laser) if irf is None else irf,
-            source_start=axis[0],
-            source_width=axis[1],
-            source_bins=shape[2],
-            edges=seen.start + seen.edges,
-            period=seen.period if detector.wrap else None,
-        )
+            detector_response(detector, laser) if irf is None else irf, source_start=axis[0], source_width=axis[1],
+            source_bins=shape[2], edges=seen.start + seen.edges, period=seen.period if detector.wrap else None,
+        )  # fmt: skip
         image, even = (shape[0], shape[1]), tdc_widths is None
         return cls(detector=detector, window=seen, image=image, noise=noise, matrix=matrix, equal_bins=even)
 
@@ -311,8 +307,7 @@ class Frames:
     frames: int
     first_frame: int
     gate_start: float
-    """Start of the detector's window [s]. Where time wraps, a count at time t stands for light at t plus any number of
-    periods."""
+    """Start of the detector's window [s]. Where time wraps, a count at t stands for light at t plus whole periods."""
     bin_width: float  # nominal [s]
     edges: NDArray[np.float64]  # `[T + 1]`, actual bin edges from `gate_start` [s] (differential non-linearity)
     period: float | None  # of the pulses [s], where time wraps; else None
@@ -547,6 +542,9 @@ def detect(
         to_caller: Any = tensor_of if as_torch else wp.array.numpy
         expected, known = (to_caller(rows)[:, : seen.recorded].reshape(*image, -1) for rows in (hazard, known))
     notes = seen.missing_light(axis[0]) if detector.wrap else ()
+    if (begin := 1e9 * seen.start) >= (end := 1e9 * (axis[0] + shape[2] * axis[1])):
+        text = f"window: begins at {begin:g} ns, after the source ends at {end:g} ns: light there is of earlier pulses"
+        warnings.warn(text, SpadwarpWarning, stacklevel=3)
     ratio = None
     if isinstance(result, Result) and result.batches > 1:
         exposed = with_frames(result, pulses, detector, laser)
@@ -556,20 +554,10 @@ def detect(
     elif scene is not None:
         notes += (UNKNOWN_NOISE,)
     return Frames(
-        counts=counts,
-        expected=expected,
-        background=known,
-        gate_start=seen.start,
-        bin_width=axis[1],
-        edges=seen.edges[: seen.recorded + 1],
-        period=seen.period if detector.wrap else None,
-        irf=irf,
-        tags=found,
-        detector=detector,
-        notes=notes,
-        target_noise_ratio=ratio,
-        **numbers,
-    )
+        counts=counts, expected=expected, background=known, gate_start=seen.start, bin_width=axis[1],
+        edges=seen.edges[: seen.recorded + 1], period=seen.period if detector.wrap else None, irf=irf, tags=found,
+        detector=detector, notes=notes, target_noise_ratio=ratio, **numbers,
+    )  # fmt: skip
 
 
 def _draw(
@@ -589,17 +577,11 @@ def _draw(
     found = None
     if by_event:
         counts, events = kernels.event_counts(
-            hazard,
-            edges=window.edges,
-            recorded=window.recorded,
-            period=window.period,
-            gated=detector.mode != "free_running",
-            dead_time=detector.dead_time_ns * 1e-9,
+            hazard, edges=window.edges, recorded=window.recorded, period=window.period,
+            gated=detector.mode != "free_running", dead_time=detector.dead_time_ns * 1e-9,
             afterpulsing_probability=detector.afterpulsing_probability,
-            afterpulsing_time_constant=detector.afterpulsing_time_constant_ns * 1e-9,
-            tags=tags,
-            **common,
-        )
+            afterpulsing_time_constant=detector.afterpulsing_time_constant_ns * 1e-9, tags=tags, **common,
+        )  # fmt: skip
         if events is not None:
             frame, pixel = np.divmod(events["row"], receiver.image[0] * receiver.image[1])
             y, x = np.divmod(pixel, receiver.image[1])

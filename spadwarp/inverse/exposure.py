@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 import os
+import warnings
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -13,10 +14,11 @@ from numpy.typing import NDArray
 
 from spadwarp.frames import Frames, FramesFile, Histograms, InstrumentResponse, is_frames_file, read_histograms
 from spadwarp.frames.spad import Window
+from spadwarp.io.paths import file_within
 from spadwarp.result import NOISE_GOAL
 from spadwarp.scene import Detector, Scene, phase_function
 from spadwarp.transport import truth_maps
-from spadwarp.values import ArgumentError, check_integer
+from spadwarp.values import ArgumentError, SpadwarpWarning, check_integer, shown
 
 __all__ = ["Exposure", "lidar_initial_guess", "read_exposure"]
 
@@ -76,7 +78,7 @@ def read_exposure(counts: Any, scene: Scene, *, pulses: int | None = None, **fac
     """
     name, gate = "counts", scene.gate
     if isinstance(counts, str | os.PathLike):
-        path = Path(counts)
+        path = file_within(Path(counts), ("frames.h5",))
         name = str(path)
         is_frames = path.suffix.lower() in (".h5", ".hdf5") and is_frames_file(path)
         counts = FramesFile.load(path) if is_frames else read_histograms(path, **facts)
@@ -85,7 +87,9 @@ def read_exposure(counts: Any, scene: Scene, *, pulses: int | None = None, **fac
         start, width, irf, noise = counts.gate_start, counts.bin_width, counts.irf, counts.target_noise_ratio
         steps = np.diff(counts.edges)
         widths = None if np.allclose(steps, steps[0], rtol=1e-9) else steps
-        pulses = counts.pulses if pulses is None else pulses
+        if pulses not in (None, counts.pulses):
+            raise ArgumentError(f"{name}: pulses = {pulses}; its frames are of {counts.pulses}: leave it out")
+        pulses = counts.pulses
         if isinstance(counts, Frames) and counts.summed:
             pulses *= counts.frames
             noise = None if noise is None else noise * counts.frames
@@ -93,8 +97,11 @@ def read_exposure(counts: Any, scene: Scene, *, pulses: int | None = None, **fac
     elif isinstance(counts, Histograms):
         start, irf, values = counts.gate_start, counts.irf, counts.values
         width = width if counts.bin_width is None else counts.bin_width
-    pulses = scene.detector.pulses_per_frame if pulses is None else check_integer("pulses", pulses, "[1, 1e15]")
     cube, frames = _added_up(values, scene, name)
+    if pulses is None and (assumed := scene.detector.pulses_per_frame) == Detector().pulses_per_frame:
+        text = f"{name}: pulses are not given: {assumed} a frame are assumed, and all light is in proportion to them"
+        warnings.warn(text, SpadwarpWarning, stacklevel=2)
+    pulses = scene.detector.pulses_per_frame if pulses is None else check_integer("pulses", pulses, "[1, 1e15]")
     if abs(width / gate.bin_width - 1.0) > 1e-6:
         raise ArgumentError(
             f"{name}: bins of {width * 1e12:g} ps; the scene's gate.bin_width_ps, {gate.bin_width_ps:g}, has to be that"
@@ -106,20 +113,17 @@ def read_exposure(counts: Any, scene: Scene, *, pulses: int | None = None, **fac
         if cube.shape[1] != gated:
             raise ArgumentError(f"{name}: {cube.shape[1]} bins; the detector has {gated} in the scene's gate")
     return Exposure(
-        counts=cube,
-        pulses=pulses * frames,
-        window=(start, cube.shape[1]),
-        tdc_widths=widths,
-        irf=irf,
+        counts=cube, pulses=pulses * frames, window=(start, cube.shape[1]), tdc_widths=widths, irf=irf,
         noise_ratio=None if noise is None else noise * frames,
-    )
+    )  # fmt: skip
 
 
 def _added_up(values: Any, scene: Scene, name: str) -> tuple[NDArray[np.int64], int]:
     """Counts `[pixel, bin]` over all frames, and the number of these; `name`: of the counts, for messages."""
     array, image = np.asarray(values), (scene.camera.height, scene.camera.width)
     if array.ndim not in (3, 4) or array.size == 0 or array.dtype.kind not in "biuf":
-        raise ArgumentError(f"{name}: {array.dtype} {array.shape}; [H, W, T] or [frames, H, W, T] is needed")
+        given = shown(values) if array.ndim == 0 else f"{array.dtype} {array.shape}"
+        raise ArgumentError(f"{name}: {given}; [H, W, T] or [frames, H, W, T] is needed, as `detect` draws it")
     if array.shape[-3:-1] != image:
         raise ArgumentError(f"{name}: an image of {array.shape[-3:-1]}; that of the scene, {image}, is needed")
     if array.dtype.kind == "f" and not np.array_equal(array, np.rint(array)):
@@ -133,8 +137,7 @@ def _added_up(values: Any, scene: Scene, name: str) -> tuple[NDArray[np.int64], 
 
 
 def _check_countable(counts: NDArray[np.int64], pulses: int, detector: Detector, window: Window, name: str) -> None:
-    """Refuses counts `[pixel, bin]` of bins that the detector does not have, or more than it can count in so many
-    pulses. Raises `ArgumentError`."""
+    """Refuses counts `[pixel, bin]` of more bins, or more in so many pulses, than the detector has: `ArgumentError`."""
     if counts.shape[1] > window.recorded:
         raise ArgumentError(
             f"{name}: {counts.shape[1]} bins; the detector starts anew with each pulse, after {window.recorded} bins "

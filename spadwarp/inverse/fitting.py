@@ -29,7 +29,7 @@ from spadwarp.inverse.equations import Equations, Law, Moments, Solution, pseudo
 from spadwarp.inverse.exposure import Exposure, lidar_initial_guess, read_exposure
 from spadwarp.inverse.goodness import Goodness, Lost, goodness_of, significance
 from spadwarp.inverse.rendering import Half, Renderer
-from spadwarp.inverse.unknowns import BACKGROUND, DEPTH, Unknown, read_unknowns, scene_value, with_values
+from spadwarp.inverse.unknowns import BACKGROUND, DEPTH, Unknown, by_name, read_unknowns, scene_value, with_values
 from spadwarp.scene import Detector, Scene, SceneLike, as_scene
 from spadwarp.transport import Progress, truth_maps
 from spadwarp.values import SEED, ArgumentError, ConfigError, check_integer, check_real, count, percent
@@ -349,7 +349,7 @@ class Fitter:
         self.photons = _PHOTONS[kind] if photons is None else check_integer("photons", photons, "[1000, 1e12]")
         seed = check_integer("seed", seed, SEED)
         self.render = Renderer(self.scene, self.unknowns, exposure, device=device, seed=seed)
-        self.prior = self._checked(prior or {})
+        self.prior = self._checked(by_name(self.scene, prior or {}))
         self.law = _detector_law(self.scene.detector, self.render.window)
         self.image = (self.scene.camera.height, self.scene.camera.width)
 
@@ -373,7 +373,7 @@ class Fitter:
     ) -> Fit:
         """Fits the exposure as `spadwarp.fit` does; `near`: the guess is within some standard errors already."""
         began, first, exposure = time.perf_counter(), self.render.photons, self.exposure
-        state = self._initial_state(dict(initial_guess or {}))
+        state = self._initial_state(by_name(self.scene, initial_guess or {}))
         begin, counts = state.means(), exposure.counts
         assert counts is not None
         if not counts.any():
@@ -475,7 +475,8 @@ class Fitter:
         values: dict[str, Any] = {}
         for unknown in self.unknowns:
             name = unknown.name
-            value = check_real(f"initial_guess of {name}", guess.get(name, scene_value(self.scene, unknown)))
+            within = "(0, inf)" if name in guess and unknown.is_positive else "(-inf, inf)"
+            value = check_real(f"initial_guess of {name}", guess.get(name, scene_value(self.scene, unknown)), within)
             if unknown.is_positive and value <= 0.0:
                 value = 1.0 if name == BACKGROUND else 0.01
             values[name] = np.full(self.image[0] * self.image[1], value) if unknown.per_pixel else value

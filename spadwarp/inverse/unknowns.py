@@ -80,6 +80,11 @@ def read_unknowns(scene: Scene, names: str | Sequence[str]) -> tuple[Unknown, ..
     return tuple(unknowns.values())
 
 
+def by_name(scene: Scene, values: Mapping[str, Any]) -> dict[str, Any]:
+    """Values of unknowns by their full names. Raises what `read_unknowns` raises."""
+    return {read_unknowns(scene, [name])[0].name: value for name, value in values.items()}
+
+
 def _read(scene: Scene, word: str) -> Unknown:
     name, _, spread = word.partition(":")
     if spread not in ("", "pixel"):

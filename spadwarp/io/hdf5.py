@@ -253,8 +253,7 @@ class Hdf5File:
     def stored(self, name: str, kind: Any, shape: Sequence[int | None]) -> Stored:
         """A dataset such as "truth/depth", checked and not yet read.
 
-        `kind`: its dtype, or several that it may have, "S" for text of any length; `shape`: None for a side of any
-        length.
+        `kind`: its dtype, or several that it may have, "S" for text; `shape`: None for a side of any length.
         """
         dataset = self._dataset(name, self._object(name))
         kinds = kind if isinstance(kind, tuple) else (kind,)
@@ -325,8 +324,7 @@ class Hdf5File:
         return place
 
     def _dataset(self, name: str, item: Any) -> Any:
-        """An object, if it is a dataset that lies in this file, is packed by what HDF5 knows itself, and can be as
-        large as it says."""
+        """An object, if it is a dataset of this file, packed as HDF5 itself does, that can be as large as it says."""
         import h5py
 
         if not isinstance(item, h5py.Dataset):
@@ -357,8 +355,7 @@ class Hdf5File:
 
 
 # HDF5 walks through a "global heap collection", in which it keeps text of any length, from object to object by sizes
-# that stand in the file; sizes that do not fit make it walk for ever, or out of its memory. Layout: HDF5 File Format
-# Specification, III.E.
+# that stand in the file; wrong ones make it walk for ever, or out of its memory. HDF5 File Format Specification, III.E.
 _MARK = b"GCOL\x01"  # with the version, since the letters alone also occur by chance in packed numbers
 _SUPERBLOCK = b"\x89HDF\r\n\x1a\n"
 _HEADER = 16  # bytes, of a collection and of each object in it

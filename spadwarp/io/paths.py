@@ -70,18 +70,14 @@ def similar(path: str | os.PathLike[str]) -> str:
 
 def used(path: str | os.PathLike[str]) -> str:
     """Addition to an error about a file of another kind: how a scene, a mesh, a picture, counts or a result is used."""
-    ending = Path(path).suffix.lower()
-    if ending == ".toml":
-        return f"; if it is a scene, `spadwarp simulate {path} --out DIR` makes a result of it"
-    if ending in MESH_ENDINGS:
-        return f"; a mesh goes into a scene: `spadwarp simulate SCENE --mesh {path} --out DIR`"
-    if ending in (".exr", ".png"):
-        return f"; a picture holds no histograms; give its run, the folder {Path(path).parent}"
-    if ending in (".npy", ".npz", ".mat", ".ptu"):
-        return f"; if it holds counts, `spadwarp depth {path} --out DIR` makes depth of them"
-    if ending in (".h5", ".hdf5"):
-        return "; HDF5 files hold results, and a scene is a .toml file"
-    return ""
+    texts = {
+        (".toml",): f"if it is a scene, `spadwarp simulate {path} --out DIR` makes a result of it",
+        MESH_ENDINGS: f"a mesh goes into a scene: `spadwarp simulate SCENE --mesh {path} --out DIR`",
+        (".exr", ".png"): f"a picture holds no histograms; give its run, the folder {Path(path).parent}",
+        (".npy", ".npz", ".mat", ".ptu"): f"if it holds counts, `spadwarp depth {path} --out DIR` makes depth of them",
+        (".h5", ".hdf5"): "HDF5 files hold results, and a scene is a .toml file",
+    }
+    return next((f"; {text}" for endings, text in texts.items() if Path(path).suffix.lower() in endings), "")
 
 
 def file_problem(path: str | os.PathLike[str]) -> str | None:

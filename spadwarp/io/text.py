@@ -1,5 +1,4 @@
-"""Text files: TOML, JSON and columns of numbers, read with limits to what a small file can cost, and written. Facts and
-progress as text for people."""
+"""Text files: TOML, JSON, columns of numbers, read with limits to their cost, and written; progress as text."""
 
 from __future__ import annotations
 
@@ -47,7 +46,8 @@ def read_text(path: str | os.PathLike[str], *, largest: int = _LARGEST_TEXT) -> 
     try:
         return content.decode("utf-8-sig")
     except UnicodeDecodeError as error:
-        raise FileError(f"{path}: not a text file: {error}{used(path)}") from None
+        other = "" if str(path).lower().endswith(".toml") else used(path)
+        raise FileError(f"{path}: not a text file in UTF-8: {error}{other or '; save it as UTF-8'}") from None
 
 
 def read_toml(path: str | os.PathLike[str]) -> dict[str, Any]:
@@ -140,7 +140,7 @@ def read_columns(path: str | os.PathLike[str], columns: Mapping[str, str]) -> ND
     """The first columns of a .csv file, `[rows, columns]`; `columns`: name → range, such as "[0, 180]".
 
     Lines that begin with # and one line of names are passed over. Raises `FileError` if it cannot be read,
-    `ConfigError` for a line that is not so many numbers in their ranges.
+    `ConfigError` for a name with another unit than the column's, a line that is not so many numbers in their ranges.
     """
     rows: list[list[float]] = []
     named = False
@@ -158,6 +158,11 @@ def read_columns(path: str | os.PathLike[str], columns: Mapping[str, str]) -> ND
                 raise ValueError(f"{shown(','.join(cells))} is not {','.join(columns)} in finite numbers")
             else:
                 named = True
+                for cell, name in zip(cells, columns, strict=False):  # "time [ns]" of time_ps is another unit
+                    unit, words = name.rpartition("_")[2], re.split(r"[\s_()\[\],/]+", cell)
+                    kinds = {UNITS[word][0] for word in words if word in UNITS}
+                    if unit in UNITS and unit not in words and UNITS[unit][0] in kinds:
+                        raise ValueError(f"{shown(cell)} has another unit than the column, {name}")
     return np.array(rows, np.float64).reshape(-1, len(columns))
 
 
@@ -252,8 +257,7 @@ def progress_report(
 ) -> Callable[[str, int, int], None]:
     """An argument `progress`: `show` is called with the part that is done and its text, with None for a stage.
 
-    Ten times a second at most; or `seldom`, at every tenth, but not more often than every second, in a long run soon,
-    then ever more seldom.
+    Ten times a second at most; or `seldom`, at every tenth, once a second at most, in a long run ever more seldom.
     """
     began: tuple[float, int] | None = None  # the first report: kernels are loaded and truth maps made before it
     shown_at, shown_done, ended, patience = time.monotonic() if seldom else 0.0, 0, False, 2.0

@@ -289,7 +289,7 @@ def _load(target: Target, field: str, wavelength_nm: float = 532.0) -> _Loaded:
     """`load_target`, as arrays."""
     name, loaded = _read(target, field, wavelength_nm)
     if (count := len(loaded.faces)) == 0:
-        raise MeshError(f"{name}: the mesh has no faces")
+        raise MeshError(f"{name}: the mesh has no faces; the file is empty, cut, or of another format")
     if count * 4**target.subdivisions > MAX_FACES:
         raise MeshError(
             f"{field}.subdivisions = {target.subdivisions} makes {count * 4**target.subdivisions} faces"

@@ -505,6 +505,8 @@ def _normals(
     if (missing := hit & ~(length[..., 0] > 0.1)).any():
         row, column = np.argwhere(missing)[0]
         raise FileError(f"{path}: no normal at pixel ({row}, {column}), which has a depth")
+    if abs((typical := float(np.median(length[hit]))) - 1.0) > 0.05:
+        raise FileError(f"{path}: normals of length {typical:.3g}, not 1; colours (n + 1)/2 have to become n first")
     with np.errstate(invalid="ignore", divide="ignore"):
         normals = normals / length
     return np.where(((normals * view).sum(axis=-1) > 0)[..., None], -normals, normals)

@@ -78,8 +78,7 @@ class _Field:
         return total * np.exp(-self.decay * seen.deeper) * seen.passed
 
     def _on_faces(self, normals: Floats) -> Floats:
-        """Irradiance on faces of unit normals `[P, 3]` at the depth of the lens [W/m²/nm]: sun, sky, and the light that
-        the water sends up."""
+        """Irradiance at the depth of the lens on unit normals `[P, 3]` [W/m²/nm]: sun, sky, and light of the water."""
         rings, azimuths, down = 16, 24, self.down
         first = np.cross(down, [1.0, 0.0, 0.0] if abs(down[0]) < 0.9 else [0.0, 1.0, 0.0])
         first /= np.linalg.norm(first)

@@ -389,8 +389,7 @@ class Medium(PhaseLaw, Water):
         return [n * one.scattering for n, one in zip(self.concentrations_in(water), self.constituents, strict=True)]
 
     def shares_in(self, water: Medium | Layer) -> list[float]:
-        """Part of each constituent in the scattering of the medium or one of its layers; where nothing scatters, equal
-        parts."""
+        """Part of each constituent in the scattering of the medium or a layer; where nothing scatters, equal parts."""
         whole = math.fsum(parts := self.scattering_in(water))
         return [part / whole if whole > 0.0 else 1.0 / len(parts) for part in parts]
 
@@ -665,6 +664,8 @@ def _law_of(medium: PhaseLaw, section: str, share: float = 0.0) -> PhaseFunction
         angles, values = read_table(f"{section}.phase_table", path, {"angle_deg": "[0, 180]", "value": "[0, 1e30]"})
         try:
             density = sk.interpolated_density(np.radians(angles), values)
+            if angles[-1] < 10.0:
+                raise ValueError(f"ends at {angles[-1]:g}°: angles are in degrees, up to 180")
             first_angle = math.radians(float(angles[0]))
         except ValueError as error:
             raise ConfigError(f"{section}.phase_table: {path}: {error}") from None

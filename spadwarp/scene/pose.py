@@ -63,6 +63,8 @@ def opencv_pose(rvec: ArrayLike, tvec: ArrayLike) -> dict[str, Vector]:
     if matrix.size not in (3, 9) or (matrix.size == 9 and matrix.shape != (3, 3)) or shift.size != 3:
         raise ArgumentError(f"rvec {np.shape(rvec)} and tvec {np.shape(tvec)}; 3 numbers (or [3, 3]) and 3 are needed")
     if matrix.size == 3:
+        if not np.linalg.norm(matrix) <= 2.0 * math.pi:
+            raise ArgumentError(f"rvec = {matrix.tolist()} turns by more than 2π; it is in radians")
         matrix = Rotation.from_rotvec(matrix.ravel()).as_matrix()
     elif not (np.allclose(matrix @ matrix.T, np.eye(3), atol=1e-6) and np.linalg.det(matrix) > 0):
         raise ArgumentError(f"rvec = {matrix.tolist()} is not a rotation matrix")

@@ -193,13 +193,8 @@ class Section(_Model):
     """
 
     model_config = ConfigDict(
-        defer_build=True,
-        frozen=True,
-        extra="forbid",
-        strict=True,
-        allow_inf_nan=False,
-        protected_namespaces=(),
-    )
+        defer_build=True, frozen=True, extra="forbid", strict=True, allow_inf_nan=False, protected_namespaces=(),
+    )  # fmt: skip
     section: ClassVar[str] = ""
     """Whose presets it takes."""
     alternatives: ClassVar[tuple[str, ...]] = ()
@@ -399,10 +394,12 @@ def takes_integers(info: FieldInfo) -> bool:
 
 
 def in_field_unit(value: Any, info: FieldInfo) -> Any:
-    """A text, or the texts of a list or of a distribution, as numbers of the field's unit; all else as it is.
+    """A text, or those of a list or a table, as numbers of the field's unit; NumPy's values as Python's; all else as is.
 
     Raises `ValueError` for a text that begins like a number and is none of the field's unit.
     """
+    if isinstance(value, np.ndarray | np.generic):
+        value = value.tolist()
     if isinstance(value, list | tuple) and any(isinstance(item, str) for item in value):
         numbers = []
         for item in value:

@@ -82,8 +82,7 @@ class LinesOfSight:
     pose: tuple[Floats, Floats] | None = None
     """By the sea, of the shot of each pixel of a scan: axes `[..., 3, 3]`, position [m] in the frame of that port."""
     open: bool = False
-    """Whether light comes back from before the start as well, straight on: above the sea, of lens and laser in the
-    air."""
+    """Whether light also comes back from before the start, straight on: above the sea, lens and laser in the air."""
 
     def __getitem__(self, index: Any) -> LinesOfSight:
         """The lines of some pixels."""

@@ -15,7 +15,7 @@ from collections.abc import Callable
 
 import numpy as np
 
-from spadwarp.arrays import Floats
+from spadwarp.arrays import Floats, real_array
 from spadwarp.io.text import read_columns
 from spadwarp.values import ConfigError, check_real
 from spadwarp.water.seawater import RANGES, WATER_DEPOLARISATION
@@ -33,6 +33,10 @@ _AT_90_DEGREES, _SHIFT, _FORWARD, _DECAY = 0.66, 0.25, 25.6, 4.0
 _SLACK = 0.01
 
 
+def _cosines(values: Floats) -> Floats:
+    return np.clip(real_array("cosine", values, np.float64, within="[-1.000001, 1.000001]"), -1.0, 1.0)
+
+
 def rayleigh_matrix(cosine: Floats, depolarisation_ratio: float = WATER_DEPOLARISATION) -> Floats:
     """Matrix of molecules, or of particles much smaller than the wavelength (Hansen & Travis 1974).
 
@@ -40,7 +44,7 @@ def rayleigh_matrix(cosine: Floats, depolarisation_ratio: float = WATER_DEPOLARI
     1 + d·cos²θ; ρ, of unpolarised light scattered by 90°, in [0, 0.5], else `ArgumentError`. `[n]` → `[n, 5]`.
     """
     ratio = check_real("depolarisation_ratio", depolarisation_ratio, RANGES["depolarisation_ratio"])
-    cosine, d = np.asarray(cosine, np.float64), (1.0 - ratio) / (1.0 + ratio)
+    cosine, d = _cosines(cosine), (1.0 - ratio) / (1.0 + ratio)
     squared = d * cosine**2
     elements = (squared - d, d + squared, 2.0 * d * cosine, 0.0 * cosine, (3.0 * d - 1.0) * cosine)
     return np.stack(elements, axis=-1) / (1.0 + squared)[..., None]
@@ -54,7 +58,7 @@ def scaled_rayleigh_matrix(cosine: Floats, largest: float = _AT_90_DEGREES) -> F
     nothing across the laser's plane; `voss_fry_matrix` has. `largest`: P, −m12 at 90°, in [0, 1], else `ArgumentError`;
     0.66 is Voss & Fry's ocean. `[n]` → `[n, 5]`.
     """
-    part, cosine = check_real("largest", largest, RANGES["largest"]), np.asarray(cosine, np.float64)
+    part, cosine = check_real("largest", largest, RANGES["largest"]), _cosines(cosine)
     zero, turned = 0.0 * cosine, 2.0 * cosine / (1.0 + cosine**2)
     return np.stack([part * (cosine**2 - 1.0) / (1.0 + cosine**2), zero + 1.0, turned, zero, turned], axis=-1)
 
@@ -70,7 +74,7 @@ def voss_fry_matrix(cosine: Floats) -> Floats:
     Voss & Fry, Appl. Opt. 23, 4427 (1984); Kokhanovsky, J. Geophys. Res. 108, 3175 (2003), doi:10.1029/2001JC001222.
     `[n]` → `[n, 5]`.
     """
-    cosine = np.asarray(cosine, np.float64)
+    cosine = _cosines(cosine)
     angle = np.arccos(cosine)
     forward = _FORWARD * np.exp(-_DECAY * angle)
     squared, shifted = _AT_90_DEGREES * cosine**2, _AT_90_DEGREES * np.cos(angle - _SHIFT) ** 2

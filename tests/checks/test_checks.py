@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 import trimesh
 
-from spadwarp.checks import CheckMessage, check, summary
+from spadwarp.checks import CheckMessage, check, implausible, summary
 from spadwarp.mesh import TriangleMesh
 from spadwarp.scene import Scene, load_scene
 from spadwarp.values import SPEED_OF_LIGHT, ConfigError
@@ -251,6 +251,25 @@ def test_a_value_in_the_wrong_unit_is_told_with_the_likely_one(field, value, wor
     assert words in message.text and message.values["value"] == value
     # What it suggests is plausible.
     assert not any("plausible" in one.text for one in about(words.split('"')[1]))
+
+
+@pytest.mark.parametrize(
+    ("overrides", "field", "words"),
+    [
+        ({"medium.group_index": 1.0}, "medium.group_index", "group_index = 1 is below phase_index = 1.3415"),
+        ({"medium.salinity": 0.035}, "medium.salinity", "0.035 g/kg is not plausible"),
+        ({"detector.dead_time_ns": 50.0}, "detector.dead_time_ns", "goes with detector.mode = 'free_running'"),
+    ],
+)
+def test_without_a_ray_a_scene_shows_what_is_implausible(overrides, field, words):
+    assert implausible(BASE) == []
+    assert words in find(implausible(BASE.with_overrides(overrides)), field).text
+
+
+def test_a_spectrum_lies_about_the_laser_s_wavelength(tmp_path):
+    (tmp_path / "spectrum.csv").write_text("wavelength [nm],power\n480,1\n482,1\n")
+    messages = checked(laser__spectrum=str(tmp_path / "spectrum.csv"))
+    assert "the spectrum lies about 481 nm" in find(messages, "laser.wavelength_nm").text
 
 
 def test_a_mesh_in_millimetres_is_told_with_its_scale(tmp_path):

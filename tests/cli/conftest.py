@@ -8,6 +8,7 @@ from helpers.scenes import scene as make_scene
 
 # A laser beside a wide lens, a gate that begins at 1.8 m of path and a response of some bins.
 SECTIONS = {
+    "medium": {"phase_index": 1.0},
     "laser": {"half_angle_deg": 20.0, "position": [-0.05, 0.0, 0.0], "pulse_energy": 1e-14, "repetition_rate": 1e7},
     "camera": {"width": 5, "height": 4, "horizontal_fov_deg": 20.0, "aperture_diameter": 0.4},
     "gate": {"start_ns": 6.0, "bin_width_ps": 100.0, "bins": 150},

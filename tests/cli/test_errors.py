@@ -108,6 +108,10 @@ plan SCENE --range 10ns:60ns | is a time; a length is needed
 plan SCENE --range 3 | FROM:TO
 plan SCENE --range 9m:8m | 9m is more than 8m
 sweep SCENE --vary range=1:10cm:5 | is ambiguous
+sweep SCENE --vary range=1,foo,3 | 'foo' is not a number
+sweep SCENE --vary range=1:9:3 --vary range=2,3 | range is there twice
+sweep SCENE --vary range=1:9:3 --of budget --depth-error 1cm | --depth-error: is for --of plan
+evaluate DONE --crop 8 8 | --crop: is for a dataset
 sweep SCENE --vary medium.typo=1:2:2 --out OUT | medium.typo
 sweep SCENE --vary nonsense --out OUT | from:to:count
 sweep SCENE --medium uwoc-cleer | uwoc-clear
@@ -115,6 +119,7 @@ depth DONE --out OUT --input bin_width=5ps | the file has its own bin_width
 depth SCENE --out OUT --input bin_with=5ps | 'bin_with' is not one of bin_width, gate_start, irf
 depth SCENE --out OUT --input image_size=5 | image_size = '5' is not of the form WIDTHxHEIGHT
 denoise SCENE --out OUT --gate 90ns:110ns | group_index
+fit SCENE --bounds --unknown absorption --prior reflectance=0.5,0.1 --photons 1000 | targets[0].reflectance is not
 fit SCENE --unknown depth --prior medium.anisotropy=0.9 | is not NAME=MEAN,SD
 """
 

@@ -12,7 +12,7 @@ from scipy.io import savemat
 from helpers.cli import run
 from helpers.datasets import make, recipe
 from helpers.stepped_frames import noisy_frame, scene
-from spadwarp import ArgumentError, FileError, SpadwarpError
+from spadwarp import ArgumentError, FileError, SpadwarpError, SpadwarpWarning
 from spadwarp.dataset import FrameReader
 from spadwarp.denoise import denoise_file, files
 from spadwarp.denoise.files import read_depth
@@ -115,6 +115,18 @@ def test_histograms_become_depth_first(tmp_path):
         denoise_file(path, tmp_path)
     with pytest.raises(ArgumentError, match="bin width is missing"):
         read_depth(path, group_index=index, gate_start=0.0)
+
+
+def test_open_water_has_no_target_whether_the_response_is_known_or_not(tmp_path):
+    path, out = saved(tmp_path, np.random.default_rng(3).poisson(0.05, (16, 16, 128)).astype(np.uint16))
+    for given in ({}, response(350e-12)):
+        assert not (denoise_file(path, out, **given, **KNOWN).target_probability > 0.08).any()
+
+
+def test_depth_in_millimetres_is_warned_of(tmp_path):
+    path, _ = saved(tmp_path, np.full((16, 16), 14_800.0, np.float32))
+    with pytest.warns(SpadwarpWarning, match=r"depths of 1.48e\+04 m; no light comes back so far"):
+        read_depth(path)
 
 
 def test_a_peak_before_the_pulse_is_no_depth(tmp_path):

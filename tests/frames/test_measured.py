@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 import spadwarp
-from spadwarp.frames import instrument_response, read_histograms
+from spadwarp.frames import Histograms, depth_of, instrument_response, read_histograms
 from spadwarp.values import ArgumentError, FileError, SpadwarpWarning
 
 scipy_io = pytest.importorskip("scipy.io")
@@ -117,9 +117,7 @@ def test_facts_beside_an_array_are_read_where_they_are_seconds(tmp_path):
     assert (found.bin_width, found.gate_start, found.group_index) == (4e-12, 2e-9, 1.33)
     with h5py.File(tmp_path / "a.h5", "w") as file:  # picoseconds and nanoseconds
         file["counts"], file["bin_width"], file["gate_start"] = COUNTS, 4.0, 2.0
-    with pytest.warns(SpadwarpWarning, match="gate start is not given"):
-        found = read_histograms(tmp_path / "a.h5")
-    assert found.bin_width is None and found.gate_start == 0.0
+    assert read_histograms(tmp_path / "a.h5", bin_width=4e-12, gate_start=2e-9).gate_start == 2e-9
 
 
 WIDER = r"are .* a wider bin than 4 ps \(bin_width\) would help"
@@ -149,6 +147,31 @@ WIDER = r"are .* a wider bin than 4 ps \(bin_width\) would help"
 def test_facts_that_are_missing_or_wrong_are_asked_for(files, name, options, match):
     with pytest.raises((ArgumentError, FileError), match=match):
         read_histograms(files / name, **START, **options)
+
+
+@pytest.mark.parametrize(
+    ("facts", "words"),
+    [
+        ({"bin_width": 0.05, "gate_start": 0.0}, r"bin_width = 0.05 is outside \(0, 1e-3\) s; give it"),
+        ({"bin_width": 5e-11, "gate_start": 40.0}, r"gate_start = 40 is outside \[-1, 1\] s"),
+        ({"bin_width": 5e-8, "gate_start": 4e-8, "group_index": 1.36}, "no light comes back through water: another"),
+        ({"bin_width": 5e-11, "gate_start": 4e-8, "group_index": 1.333}, "group_index = 1.333 is a phase index"),
+    ],
+)
+def test_facts_of_a_file_in_another_unit_are_named(facts, words, tmp_path):
+    np.savez(tmp_path / "counts.npz", counts=np.ones((4, 4, 300), int), **facts)
+    with pytest.raises((ArgumentError, SpadwarpWarning), match=words):
+        depth_of(read_histograms(tmp_path / "counts.npz"), device="cpu")
+
+
+@pytest.mark.parametrize("background", [1e-4, 15.0, np.full(300, 6e-5)])
+def test_a_background_that_does_not_explain_the_counts_is_warned_of(background):
+    counts = np.random.default_rng(4).poisson(0.05, (8, 8, 300))
+    counts[..., 100] += 9
+    measured = Histograms(values=counts, bin_width=5e-11, gate_start=4e-8, group_index=1.36)
+    with pytest.warns(SpadwarpWarning, match=r"background: .* counts in a pixel do not explain its 23.8"):
+        depth_of(measured, background=background, device="cpu")
+    assert "bins from 4.409 to 6.062 m" in depth_of(measured, background=0.05, device="cpu").notes
 
 
 def test_what_is_assumed_is_said(files):

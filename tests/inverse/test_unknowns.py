@@ -87,7 +87,13 @@ def test_counts_have_to_fit_the_scene(tmp_path):
         with pytest.raises(spadwarp.ArgumentError, match=words):
             read_exposure(wrong, scene)
     with pytest.raises(spadwarp.ArgumentError, match="110"):
-        read_exposure(tmp_path / "counts.npy", scene, gate_start=0.0, bin_width=55e-12)
+        read_exposure(tmp_path / "counts.npy", scene, pulses=10, gate_start=0.0, bin_width=55e-12)
+    with pytest.warns(spadwarp.SpadwarpWarning, match="20000 a frame are assumed"):
+        read_exposure(counts, scene)
+    time = {"gate_start": 0.0, "bin_width": 1e-10}
+    frames = spadwarp.detect(np.zeros((8, 8, 160)), pulses=9, seed=0, laser=scene.laser, **time)
+    with pytest.raises(spadwarp.ArgumentError, match="pulses = 10; its frames are of 9"):
+        read_exposure(frames, scene, pulses=10)
 
 
 # The parts of the equations: laws of counting, arrow-shaped systems, shifts in time

@@ -142,6 +142,12 @@ def test_columns_may_have_a_title_comments_and_more_columns(tmp_path):
     path = tmp_path / "table.csv"
     path.write_text("# from a paper\ntime,value,error\n0,1,0.1\n\n 1.5 ,2e0\n")
     assert read_columns(path, {"time": "[0, 2]", "value": "[0, 2]"}).tolist() == [[0, 1], [1.5, 2]]
+    path.write_bytes("time (ns),Größe\n1,2\n".encode())
+    with pytest.raises(ConfigError, match=r"line 1: 'time \(ns\)' has another unit than the column, time_ps"):
+        read_columns(path, {"time_ps": "[0, 2]", "value": "[0, 2]"})
+    path.write_bytes("Größe".encode("latin-1"))
+    with pytest.raises(FileError, match="save it as UTF-8"):
+        read_text(path)
 
 
 def test_files_may_have_names_that_are_not_unicode(tmp_path):

@@ -75,6 +75,12 @@ def test_blender_depth_is_metres_and_its_normals_are_right_forward_up(tmp_path):
     np.testing.assert_allclose(truth.reflectance[0], 0.3, rtol=1e-6)
 
 
+def test_normals_stored_as_colours_are_refused(export):
+    write_exr(export / "wall_Surf_Norm.EXR", halves(filled(R=0.2, G=0.82, B=0.74)))
+    with pytest.raises(FileError, match=r"normals of length 1.12, not 1"):
+        maps(export, "wall", camera=CAMERA)
+
+
 def test_own_channels_scale_and_rotated_cameras(tmp_path):
     path = write_exr(tmp_path / "d.exr", {**planes(), **filled(distance=7.0)})
     options = {"depth": path, "depth_channel": "distance", "radial": True, "camera": CAMERA}

@@ -116,7 +116,11 @@ def test_opencv_poses_take_a_vector_or_a_matrix():
     assert opencv_pose((0, 0, 0), (1, 2, 3))["position"] == (-1.0, -2.0, -3.0)
     for rotation, angle in (((0, 0, math.pi / 2), -90), (rotation_matrix((0, 0, 90)), -90)):
         np.testing.assert_allclose(opencv_pose(rotation, (0, 0, 0))["rotation_deg"], (0, 0, angle), atol=1e-9)
-    for wrong, problem in (((0, 0), "3 numbers"), (np.diag([1, 1, -1]), "not a rotation matrix")):
+    for wrong, problem in (
+        ((0, 0), "3 numbers"),
+        (np.diag([1, 1, -1]), "not a rotation matrix"),
+        ((0, 90, 0), "radians"),
+    ):
         with pytest.raises(ValueError, match=problem):
             opencv_pose(wrong, (0, 0, 0))
     with pytest.raises(ValueError, match="no horizon"):

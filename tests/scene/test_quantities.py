@@ -3,6 +3,7 @@
 import math
 import re
 
+import numpy as np
 import pytest
 
 import spadwarp
@@ -111,3 +112,9 @@ def test_average_power_stays_where_the_rate_changes():
     replaced = faster.with_overrides(laser={"pulse_energy": "1 nJ"})
     assert replaced.laser.given == ("pulse_energy",) and replaced.laser.average_power == pytest.approx(2e-3)
     assert Scene.from_dict(replaced.to_dict()) == replaced
+
+
+def test_values_of_numpy_stand_for_those_of_python():
+    values = {"camera.width": np.int64(16), "laser.position": np.array([0, 0, 1]), "gate.bin_width_ps": np.float32(50)}
+    changed = make_scene().with_overrides(values)
+    assert (changed.camera.width, changed.laser.position, changed.gate.bin_width_ps) == (16, (0.0, 0.0, 1.0), 50.0)

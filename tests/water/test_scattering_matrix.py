@@ -48,6 +48,12 @@ def test_molecules_have_the_matrix_of_the_reference(ratio):
     np.testing.assert_allclose(density, rayleigh_density(cosine, 0.039), rtol=1e-12)
 
 
+@pytest.mark.parametrize("name", ["rayleigh_matrix", "scaled_rayleigh_matrix", "voss_fry_matrix"])
+def test_angles_are_no_cosines(name):
+    with pytest.raises(ArgumentError, match=r"cosine holds 30.0, which is outside"):
+        getattr(spadwarp.water, name)(np.array([0.5, 30.0]))
+
+
 def test_a_scaled_matrix_reaches_its_largest_polarisation_and_stays_physical():
     cosine = np.linspace(-1.0, 1.0, 41)
     for largest in (0.0, 0.66, 1.0):

@@ -37,7 +37,7 @@ def _limits(interval: str) -> tuple[float, float, bool, bool]:
 def number(name: str, value: Any, interval: str = "(-inf, inf)") -> float:
     """A finite number in an interval, as in an error: `"[0, 1)"`; closed ends hold what float32 makes of them."""
     try:
-        found = float(value)
+        found = math.nan if isinstance(value, bool | str) else float(value)
     except (TypeError, ValueError, OverflowError):
         raise ArgumentError(f"{name} = {value!r} is not a number") from None
     low, high, low_open, high_open = _limits(interval)
