@@ -197,8 +197,7 @@ def depth(
         for text in histograms.notes:
             complain(text, "note")
     pixels = histograms.values[..., 0].size if reduced is None else reduced.values.size
-    names = [f"{quantity}.{ending}" for quantity in ("depth", "range") for ending in ("npy", "exr", "png")]
-    names.append("significance.npy")
+    names = [f"{one}.{ending}" for one in ("depth", "range") for ending in ("npy", "exr", "png")] + ["significance.npy"]
     level, known = _background(background)
     check_outputs(out, names, files={"--ply": ply}, inputs=(path, level, *files), needed=32 * pixels)
     if reduced is None:
@@ -213,11 +212,9 @@ def depth(
     metres = {name: float(of(found)) for name, of in of_all.items()} if found.size else None
     summary = {"pixels": pixels, "pixels_with_return": int(found.size), "metres": metres, "quantity": reduced.quantity}
     if 2 * found.size < pixels and min_significance != 0 and reduced.method != "stored":
-        complain(
-            f"{pixels - found.size} of {pixels} pixels have no significant return and so no depth; "
-            "--min-significance 0 gives every pixel one, `spadwarp denoise` uses the pixels around it",
-            "note",
-        )
+        text = "--min-significance 0 gives every pixel one, `spadwarp denoise` uses the pixels around it"
+        text = f"{pixels - found.size} of {pixels} pixels have no significant return and so no depth; {text}"
+        complain(text, "note")
     answer({**summary, "frames": reduced.frames, "files": files})
 
 

@@ -25,7 +25,7 @@ from spadwarp.denoise.network_files import Precision, require_torch, weights_met
 from spadwarp.denoise.recipe import TrainingRecipe, load_training_recipe
 from spadwarp.files import Held, gate_of, holds_own_file, is_own_file, load, locate, sequence, stored_depth
 from spadwarp.frames.backgrounds import BackgroundLaw, profile_of_depth
-from spadwarp.frames.depth import FARTHEST, Method, Quantity, depth_of, geometry
+from spadwarp.frames.depth import FARTHEST, Method, Quantity, depth_of, geometry, with_view
 from spadwarp.frames.file import SequenceFile
 from spadwarp.frames.measured import Histograms, read_histograms, stored_images
 from spadwarp.io.arrays import read_exr, write_exr
@@ -73,7 +73,6 @@ def read_depth(
     method: Method | None = None,
     background: ArrayLike | BackgroundLaw | None = None,
     gate: tuple[float, float] | None = None,
-    group_index: float | None = None,
     device: str | None = None,
     **measured: Any,
 ) -> DepthReading:
@@ -95,10 +94,9 @@ def read_depth(
         background: Of counts whose response is known, as `spadwarp.denoise.estimate` takes it, replacing the file's;
             default: the file's, else "decay".
         gate: (start, stop) in depth [m]; of counts whose response is known, only the bins within it are used.
-        group_index: Of measured histograms, see `depth_of`; default: that of the file.
         device: Warp device of the estimator.
-        measured: What a file of measured histograms does not say, as `read_histograms` takes it; `horizontal_fov_deg`
-            for planar depth, see `depth_of`.
+        measured: What a file of measured histograms does not say, as `read_histograms` takes it, and `group_index` and
+            `horizontal_fov_deg`, as `depth_of` does.
 
     Raises:
         FileError: No such file, not readable, or without depth.
@@ -127,7 +125,7 @@ def read_depth(
         if stored.dtype.kind not in "iuf":
             raise FileError(f"{place}: {stored.dtype} {stored.shape}; depth is real numbers")
         others = ["background"] * (background is not None)
-        if given := [*(name.replace("_", " ") for name in measured if name != "dataset"), *others]:
+        if given := [*(name.replace("_", " ") for name in measured if name not in ("dataset", "group_index")), *others]:
             raise ArgumentError(f"{place} holds depth: {', '.join(given)} are of histograms")
         depth = stored.astype(np.float32)
         below = np.count_nonzero(depth < 0)
@@ -139,7 +137,7 @@ def read_depth(
         source = "depth as it is" + (f": {chosen}" if chosen else "")
         source += f"; {below} values below 0 count as not reported" if below else ""
         return DepthReading(depth=frames, frames=depth.ndim == 3, gate=None, profile=None, source=source)
-    histograms = _read_histograms(place, measured | of_result, group_index)
+    histograms = _read_histograms(place, measured | of_result)
     counted = histograms.values.dtype.kind in "iu" and histograms.response is not None
     if counted:
         histograms = _with_background(histograms, background)
@@ -150,16 +148,13 @@ def read_depth(
     return dataclasses.replace(_estimate_depth(histograms, counted, method, device), truth=truth)
 
 
-def _read_histograms(path: Path, measured: dict[str, Any], group_index: float | None) -> Histograms:
-    view = {"group_index": group_index, "horizontal_fov_deg": measured.pop("horizontal_fov_deg", None)}
-    given = {name: value for name, value in view.items() if value is not None}
-    histograms = read_histograms(path, **measured)
+def _read_histograms(path: Path, measured: dict[str, Any]) -> Histograms:
+    view = [measured.pop(name, None) for name in ("group_index", "horizontal_fov_deg")]
+    histograms = with_view(read_histograms(path, **measured), *view)
     notes = histograms.notes
     if histograms.scene is None and histograms.response is None:
         notes += ("the instrument response is not given (irf): with it, counts are denoised with their histograms",)
-    if given and histograms.scene is not None:
-        raise ArgumentError(f"{path}: the file has its own {' and '.join(given)}")
-    return dataclasses.replace(histograms, **given, notes=notes)
+    return dataclasses.replace(histograms, notes=notes)
 
 
 def _with_background(held: Histograms, given: ArrayLike | BackgroundLaw | None) -> Histograms:

@@ -394,7 +394,7 @@ def takes_integers(info: FieldInfo) -> bool:
 
 
 def in_field_unit(value: Any, info: FieldInfo) -> Any:
-    """A text, or those of a list or a table, as numbers of the field's unit; NumPy's values as Python's; all else as is.
+    """A text, or those of a list or table, as numbers of the field's unit; NumPy's values as Python's; others stay.
 
     Raises `ValueError` for a text that begins like a number and is none of the field's unit.
     """
