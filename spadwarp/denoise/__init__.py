@@ -4,7 +4,6 @@ torch and the other packages of the extra are loaded when a function needs them:
 """
 
 from spadwarp.denoise.files import *
-from spadwarp.denoise.histograms import *
 from spadwarp.denoise.inference import *
 from spadwarp.denoise.network_files import *
 from spadwarp.denoise.recipe import *

@@ -1,18 +1,17 @@
-"""Denoising without a network: filters of depth frames, and the likelihood of pixels and of whole frames."""
+"""Denoising without a network: filters of depth frames, and the names of the classical estimates from counts."""
 
 from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import replace
-from typing import Any, Literal, get_args
+from typing import Literal, get_args
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import NDArray
 
 from spadwarp.denoise.frames import DepthFrames, fill_missing
-from spadwarp.denoise.histograms import histogram_tensors
-from spadwarp.denoise.network_files import require_torch
-from spadwarp.values import ArgumentError, SpadwarpError, check_real
+from spadwarp.denoise.network_files import MODELS
+from spadwarp.values import SpadwarpError
 
 Frames = NDArray[np.float32]
 
@@ -94,7 +93,7 @@ BASELINES: dict[str, Callable[[DepthFrames], Frames]] = {
 """Baselines by name."""
 
 
-# Estimates of depth from histograms: the likelihood of pixels, of pooled pixels, and of whole frames
+# Names of the methods that estimate depth from counts, and of all.
 
 
 Classical = Literal["likelihood", "pooled", "semi-global", "total-variation", "belief-propagation"]
@@ -102,57 +101,8 @@ Classical = Literal["likelihood", "pooled", "semi-global", "total-variation", "b
 CLASSICAL: tuple[Classical, ...] = get_args(Classical)
 """Classical estimates from histograms."""
 
-TUNINGS: dict[str, tuple[Any, ...]] = {
-    "likelihood": (1,),
-    "pooled": (3, 5, 7, 11, 15),
-    "semi-global": (5.0, 10.0, 20.0, 40.0),
-    "total-variation": (0.5, 1.0, 2.0, 4.0),
-    "belief-propagation": (2.5, 4.0, 8.0, 16.0),
-}
-"""Tuned values: sides of the window [pixels], penalties of a jump [nats], strengths."""
+METHODS = (*MODELS, *(name for name in BASELINES if name != "input"), *CLASSICAL)
+"""Models of `spadwarp.denoise.estimate`."""
 
-
-def classical_depth(
-    counts: ArrayLike,
-    *,
-    background: ArrayLike,
-    response: ArrayLike,
-    method: Classical,
-    tuning: float | None = None,
-    device: str | None = None,
-) -> NDArray[np.float32]:
-    """Depth over the gate, `[N, H, W]`, 0 at its start and 1 at its end.
-
-    `"likelihood"`: of each pixel alone. `"pooled"`: of windows of pixels. `"semi-global"`: matching of the likelihoods.
-    `"total-variation"`: of the likelihood depth, each pixel weighted by how far its likelihood stands out.
-    `"belief-propagation"`: on the likelihoods, the strongest of these in most cases.
-
-    Arguments and errors are those of `spadwarp.denoise.estimate`; `tuning`: above 0, see `TUNINGS`; default: 7 pixels,
-    `usual_jump`, strength 1, a penalty of 4 nats.
-    """
-    if method not in CLASSICAL:
-        raise ArgumentError(f"method = {method!r} is not one of {', '.join(map(repr, CLASSICAL))}")
-    tuning = None if tuning is None else check_real("tuning", tuning, "(0, inf)")
-    if method == "pooled" and tuning is not None and tuning % 2 != 1:
-        raise ArgumentError(f"tuning = {tuning:g} is not an odd number of pixels, such as {TUNINGS[method]}")
-    torch = require_torch()
-    from spadwarp.denoise.classical import JUMP, aggregate, beliefs, highest, pooled, total_variation, usual_jump
-    from spadwarp.denoise.histogram_network import log_likelihood
-
-    found = []
-    with torch.inference_mode():
-        for cube, level, tap in histogram_tensors(counts, background, response, device):
-            score = log_likelihood(cube, level, tap)
-            if method == "pooled":
-                score = pooled(score, int(tuning or 7))
-            elif method == "semi-global":
-                score = aggregate(score, jump=usual_jump(score) if tuning is None else tuning)
-            elif method == "belief-propagation":
-                score = beliefs(score, JUMP if tuning is None else tuning)
-            depth = highest(score)
-            if method == "total-variation":
-                weight = score.amax(dim=-1).clamp(0.0, 20.0)
-                weight /= weight.mean().clamp_min(1e-9)
-                depth = total_variation(depth, weight, strength=tuning or 1.0)
-            found.append(depth[0].cpu().numpy())
-    return np.stack(found).astype(np.float32)
+FROM_COUNTS = ("histograms", *CLASSICAL)
+"""Those that use counts."""

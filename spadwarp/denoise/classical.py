@@ -1,4 +1,4 @@
-"""Classical estimates: windows, guides, and smooth surfaces.
+"""Classical estimates from counts: the likelihood of pixels, of windows, and of whole frames.
 
 A `score` is the log-likelihood of a return in each bin of each pixel, `[B, H, W, T]` [nats].
 """
@@ -7,13 +7,103 @@ from __future__ import annotations
 
 from typing import cast
 
+import numpy as np
 import torch
 import torch.nn.functional as F
 import warp as wp
+from numpy.typing import NDArray
 from torch import Tensor
 
+from spadwarp.denoise.baselines import Classical
+from spadwarp.denoise.histograms import CountFrames
 from spadwarp.device import start_warp
 from spadwarp_kernels.detection import launch_messages
+
+TUNINGS: dict[Classical, tuple[float, ...]] = {
+    "likelihood": (1,),
+    "pooled": (3, 5, 7, 11, 15),
+    "semi-global": (5.0, 10.0, 20.0, 40.0),
+    "total-variation": (0.5, 1.0, 2.0, 4.0),
+    "belief-propagation": (2.5, 4.0, 8.0, 16.0),
+}
+"""Tuned values: sides of the window [pixels], penalties of a jump [nats], strengths."""
+
+
+def classical_depth(
+    frames: CountFrames, *, method: Classical, tuning: float | None = None, device: str | None = None
+) -> NDArray[np.float32]:
+    """Depth over the gate, `[N, H, W]`, 0 at its start and 1 at its end.
+
+    `"likelihood"`: of each pixel alone. `"pooled"`: of windows of pixels. `"semi-global"`: matching of the likelihoods.
+    `"total-variation"`: of the likelihood depth, each pixel weighted by how far its likelihood stands out.
+    `"belief-propagation"`: on the likelihoods, the strongest of these in most cases.
+
+    `tuning`: see `TUNINGS`; default: 7 pixels, `usual_jump`, strength 1, a penalty of 4 nats.
+    """
+    found = []
+    with torch.inference_mode():
+        for cube, level, tap in frames.tensors(device):
+            score = log_likelihood(cube, level, tap)
+            if method == "pooled":
+                score = pooled(score, int(tuning or 7))
+            elif method == "semi-global":
+                score = aggregate(score, jump=usual_jump(score) if tuning is None else tuning)
+            elif method == "belief-propagation":
+                score = beliefs(score, JUMP if tuning is None else tuning)
+            depth = highest(score)
+            if method == "total-variation":
+                weight = score.amax(dim=-1).clamp(0.0, 20.0)
+                weight /= weight.mean().clamp_min(1e-9)
+                depth = total_variation(depth, weight, strength=tuning or 1.0)
+            found.append(depth[0].cpu().numpy())
+    return np.stack(found).astype(np.float32)
+
+
+_LEAST_SIGNAL = 0.05  # counts
+_UNIFORM_SHARE = 0.3  # part of the signal that may come at any time, so that photons far from the return say little
+
+
+def toeplitz(response: Tensor, bins: int) -> Tensor:
+    """Response `[B, 2 r + 1]` in bin j to a return in bin k, `[B, j, k]`."""
+    radius = response.shape[-1] // 2
+    place = torch.arange(bins, device=response.device)
+    distance = place[:, None] - place
+    inside = distance.abs() <= radius
+    return torch.where(inside, response[:, (distance + radius).clamp(0, 2 * radius)], 0.0)
+
+
+def log_likelihood(counts: Tensor, background: Tensor, response: Tensor) -> Tensor:
+    """Log-likelihood ratio of a return in each bin, less what background alone gives on average, `[B, H, W, T]`.
+
+    Σ_j (n_j − B_j) ln(1 + S h_{j−k} / B'_j), so that dim pixels are not drawn to where background is high. S is the
+    mean signal of the frame, h the response, B' the background plus 0.3 S spread evenly over the gate. The sum over
+    pixels is that of the pixels together.
+
+    Args:
+        counts: Histograms over the gate, `[B, H, W, T]`.
+        background: Expected background counts, > 0, of each pixel `[B, H, W, T]` or the same for all `[B, 1, 1, T]`.
+        response: Instrument response per bin centred on its time zero, sum 1, `[B, 2 r + 1]`.
+    """
+    above, bins = counts - background, counts.shape[-1]
+    signal = above.sum(dim=-1).mean(dim=(1, 2)).clamp_min(_LEAST_SIGNAL)
+    floor = background.mean(dim=(1, 2)) + _UNIFORM_SHARE * signal[:, None] / bins
+    template = torch.log1p(signal[:, None, None] / floor[:, :, None] * toeplitz(response, bins))
+    return torch.bmm(above.flatten(1, 2), template).view_as(above)
+
+
+def deviation(response: Tensor, least: float) -> Tensor:
+    """Standard deviation of responses `[B, 2 r + 1]` about their time zero, `[B]` [bins]; its square is >= `least`."""
+    offset = torch.arange(response.shape[-1], device=response.device) - response.shape[-1] // 2
+    return (response * offset.square()).sum(dim=-1).clamp_min(least).sqrt()
+
+
+def interpolated(cumulative: Tensor, place: Tensor) -> Tensor:
+    """Of cumulative counts at the edges of bins `[..., T + 1]`, those before places `[..., E]` [bins]."""
+    bins = cumulative.shape[-1] - 1
+    place = place.clamp(0.0, float(bins))
+    below = place.long().clamp(max=bins - 1)
+    cumulative = cumulative.expand(*place.shape[:-1], bins + 1)
+    return torch.lerp(cumulative.gather(-1, below), cumulative.gather(-1, below + 1), place - below)
 
 
 def pooled(cube: Tensor, side: int) -> Tensor:

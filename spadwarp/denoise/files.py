@@ -17,14 +17,21 @@ from numpy.typing import ArrayLike, NDArray
 
 from spadwarp.dataset import FrameReader, read_manifest
 from spadwarp.dataset.shards import SceneFile
-from spadwarp.denoise.baselines import BASELINES, CLASSICAL
-from spadwarp.denoise.frames import MARGIN, checked_gate, depth_frames
-from spadwarp.denoise.histograms import dim_pixels, second_return, target_bins, without_defects
-from spadwarp.denoise.inference import Estimate, detected, estimate_frames, estimate_histograms, target_threshold
+from spadwarp.denoise.baselines import BASELINES, FROM_COUNTS
+from spadwarp.denoise.frames import MARGIN, checked_gate
+from spadwarp.denoise.histograms import CountFrames, dim_pixels, target_bins, without_defects
+from spadwarp.denoise.inference import (
+    Estimate,
+    detected,
+    estimate_depth,
+    estimate_histograms,
+    second_return,
+    target_threshold,
+)
 from spadwarp.denoise.network_files import Precision, require_torch, weights_metadata
 from spadwarp.denoise.recipe import TrainingRecipe, load_training_recipe
 from spadwarp.files import Held, gate_of, holds_own_file, is_own_file, load, locate, sequence, stored_depth
-from spadwarp.frames.backgrounds import BackgroundLaw, profile_of_depth
+from spadwarp.frames.backgrounds import BackgroundLaw
 from spadwarp.frames.depth import FARTHEST, Method, Quantity, depth_of, geometry, with_view
 from spadwarp.frames.file import SequenceFile
 from spadwarp.frames.measured import Histograms, read_histograms, stored_images
@@ -167,7 +174,7 @@ def _with_background(held: Histograms, given: ArrayLike | BackgroundLaw | None) 
     used = without_defects(held.values, known, held.response.per_bin(float(held.bin_width or 0.0)))
     notes = [used.estimated.summary] if used.estimated is not None and known != "none" else []
     notes += [used.defects.summary] if used.defects is not None else []
-    level_known = used.estimated is None and (given is not None or held.level_known)
+    level_known = used.level_known and (given is not None or held.level_known)
     return dataclasses.replace(
         held, values=used.counts, background=used.background, level_known=level_known, notes=(*held.notes, *notes)
     )
@@ -348,25 +355,19 @@ def denoise_file(
             raise ArgumentError(f"gate = ({gate[0]:g}, {gate[1]:g}) m holds none of the depths of the file, {extent}")
     with warnings.catch_warnings(record=True) as caught:
         warnings.simplefilter("always")
-        counts = read.histograms if model in ("pyramid", "histograms", *CLASSICAL) else None
-        counting = counts is not None and (weights is None or weights_metadata(model, weights)["model"] == "histograms")
-        if counts is not None and counting:
-            model = "histograms" if model == "pyramid" else model
+        second, held, profile = None, read.histograms, read.profile if profile is None else profile
+        options: dict[str, Any] = {"model": model, "weights": weights, "device": device}
+        uses_counts = held is not None and model in ("pyramid", *FROM_COUNTS)
+        if uses_counts and (weights is None or weights_metadata(model, weights)["model"] == "histograms"):
+            options["model"] = model = "histograms" if model == "pyramid" else model
             notes.append("denoised with its histograms")
-            found, second = _from_counts(read, counts, profile, model, weights, device)
+            found, second = _from_counts(read, **options)
         else:
-            second = None
-            profile = read.profile if profile is None else profile
-            if profile is None and model in ("pyramid", "gating"):
-                profile = profile_of_depth(read.depth, gate)
-            frames = depth_frames(read.depth, gate=gate, profile=profile)
-            found = estimate_frames(frames, model=model, weights=weights, device=device, precision=precision)
-        if (held := read.histograms) is not None and held.response is not None and held.background is not None:
+            found = estimate_depth(read.depth, gate=gate, profile=profile, precision=precision, **options)
+        if held is not None:
             if min_significance is None:
                 min_significance = 4.0 if held.scene is None else held.scene.detector.min_significance
-            test: dict[str, Any] = {"min_significance": min_significance, "level_known": held.level_known}
-            response = held.response.per_bin(float(held.bin_width or 0.0))
-            found = detected(found, held.values, held.background, response, model=model, **test)
+            found = detected(found, _count_frames(held), model=model, min_significance=min_significance)
         depth = found.depth if mask is None else found.masked(mask)
     notes += [str(warning.message) for warning in caught]
     if empty := np.count_nonzero(np.isnan(depth).all(axis=(1, 2))):
@@ -430,35 +431,30 @@ def _write(
     return [*(folder / f"{name}{ending}.npy" for ending in arrays), write_exr(folder / f"{name}.exr", first, metadata)]
 
 
-def _from_counts(
-    read: DepthReading,
-    histograms: Histograms,
-    profile: NDArray[np.float64] | None,
-    model: str,
-    weights: str | Path | None,
-    device: str | None,
-) -> tuple[Estimate, NDArray[np.float32]]:
+def _count_frames(held: Histograms) -> CountFrames:
+    """Counts whose response and background are known."""
+    assert held.response is not None and held.background is not None
+    response = held.response.per_bin(float(held.bin_width or 0.0)).astype(np.float32)
+    return CountFrames(held.values, held.background, response, held.level_known)
+
+
+def _from_counts(read: DepthReading, **options: Any) -> tuple[Estimate, NDArray[np.float32]]:
     """The estimate of a method that uses counts, in the bins that hold the target; and second returns [m]."""
-    width, counts = float(histograms.bin_width or 0.0), histograms.values
-    known = np.asarray(histograms.background, np.float32)
-    known = np.broadcast_to(known, counts.shape[-3:] if known.ndim == 3 else counts.shape[-1:])
-    assert histograms.response is not None and read.gate is not None
-    response = histograms.response.per_bin(width)
-    first, stop, part = target_bins(counts, known, response, read.gate)
-    some, level = counts[..., first:stop], known[..., first:stop]
-    start = histograms.gate_start + first * width
+    held = read.histograms
+    assert held is not None and read.gate is not None
+    frames, width = _count_frames(held), float(held.bin_width or 0.0)
+    bins = target_bins(frames)
+    start, extent = held.gate_start + bins.start * width, (bins.stop - bins.start) * width
 
     def to_depth(place: NDArray[np.float32]) -> NDArray[np.float64]:
-        time = start + place.astype(np.float64) * (some.shape[-1] * width)
-        return depth_at(time, histograms)
+        return depth_at(start + place.astype(np.float64) * extent, held)
 
-    found = estimate_histograms(
-        read.depth, counts, known, response, bins=slice(first, stop), gate=part, model=model, to_depth=to_depth,
-        weights=weights, device=device,
-    )  # fmt: skip
+    in_depth = (read.gate[1] - read.gate[0]) / held.values.shape[-1]
+    found = estimate_histograms(read.depth, frames, bins=bins, bin_width=in_depth, to_depth=to_depth, **options)
     near, far = (to_depth(np.full_like(found.depth, place)) for place in (0.0, 1.0))
-    place = ((found.depth - near) / (far - near)).reshape(some.shape[:-1])  # depth is linear in the place
-    second = second_return(place, some, background=level, response=response, device=device)
+    counts, level, response = frames.part(bins)[:3]
+    place = ((found.depth - near) / (far - near)).reshape(counts.shape[:-1])  # depth is linear in the place
+    second = second_return(place, counts, background=level, response=response, device=options["device"])
     return found, to_depth(second.reshape(found.depth.shape)).astype(np.float32)
 
 

@@ -46,18 +46,13 @@ class DepthFrames:
         start, stop = self.gate
         return ((self.depth - start) / (stop - start)).astype(np.float32)
 
-    def network_input(self) -> NDArray[np.float32]:
-        """Channels for a network that does not see which pixels reported: see `spadwarp.denoise.networks`.
+    def filled(self) -> NDArray[np.float32]:
+        """`scaled` for a network that does not see which pixels reported; 1 where a depth is still missing.
 
         Missing ones get the nearest depth where those around them report nearly as often as elsewhere.
         """
-        scaled = self.scaled
-        for depth, level in zip(scaled, self.density, strict=True):
-            depth[:] = depth[_fill_source(depth, level)]
-        reported = ~np.isnan(scaled)
-        log_density = np.log(np.clip(self.density, math.exp(-LOG_DENSITY_LIMIT), math.exp(LOG_DENSITY_LIMIT)))
-        channels = (np.where(reported, scaled, 1.0), reported, np.where(reported, log_density, 0.0))
-        return np.stack([channel.astype(np.float32) for channel in channels], axis=1)
+        images = map(_filled, self.scaled, self.density)
+        return np.stack([np.nan_to_num(image, nan=1.0) for image in images])
 
 
 def checked_gate(gate: tuple[float, float]) -> tuple[float, float]:
@@ -129,41 +124,40 @@ def depth_frames(
     return DepthFrames(depth=values, gate=(start, stop), density=relative)
 
 
-def _fill_source(depth: NDArray[np.float32], density: NDArray[np.float32]) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
-    """Rows and columns `[H, W]` from which each pixel takes its value: its own, or those of the nearest that reported.
+def _filled(depth: NDArray[np.float32], density: NDArray[np.float32]) -> NDArray[np.float32]:
+    """A frame `[H, W]` of depth over the gate with missing pixels filled from the nearest, as far as they may be.
 
     Beside a target, where backscatter alone is reported, pixels report less often than on it, and must not be filled.
     So a missing pixel is filled only where, of the pixels in a window around it, at least half as many report as in the
     window that holds the most. The window has 15 × 15 pixels, or as many as hold 64 reports. No pixel is filled
     unless successive depths agree more often than backscatter would.
     """
-    from scipy.ndimage import distance_transform_edt, uniform_filter
+    from scipy.ndimage import uniform_filter
 
     reported = ~np.isnan(depth)
-    source = np.indices(depth.shape)
     agreeing = np.count_nonzero(np.abs(np.diff(depth[reported])) < 0.01)
     by_chance = np.minimum(0.02 * density[reported], 1.0).sum()
+    if agreeing <= 1.3 * by_chance + 10:
+        return depth
     side = 2 * round(max(7.0, 4.0 / math.sqrt(max(reported.mean(), 1e-4)))) + 1
     frequency = uniform_filter(reported.astype(np.float32), side, mode="constant")
     inside = uniform_filter(np.ones_like(frequency), side, mode="constant")  # part of the window within the image
-    filled = ~reported & (frequency >= 0.5 * frequency.max() * inside)
-    if filled.any() and agreeing > 1.3 * by_chance + 10:
-        nearest = distance_transform_edt(~reported, return_distances=False, return_indices=True)
-        source = np.where(filled, nearest, source)
-    return source[0], source[1]
+    return np.where(frequency >= 0.5 * frequency.max() * inside, fill_missing(depth, 1.0), depth)
 
 
 def fill_missing(image: NDArray[np.float32], otherwise: float) -> NDArray[np.float32]:
     """An image `[H, W]` with each NaN replaced by its nearest number, or all by `otherwise` where there is none."""
-    from scipy.ndimage import distance_transform_edt
-
     missing = np.isnan(image)
     if missing.all():
         return np.full_like(image, otherwise)
-    if not missing.any():
-        return image
-    nearest = distance_transform_edt(missing, return_distances=False, return_indices=True)
-    return image[tuple(nearest)]
+    return image[tuple(nearest(missing))] if missing.any() else image
+
+
+def nearest(missing: NDArray[np.bool_]) -> NDArray[np.int32]:
+    """Of each element, the indices of the nearest that is not missing, `[dimensions, …]`."""
+    from scipy.ndimage import distance_transform_edt
+
+    return np.asarray(distance_transform_edt(missing, return_distances=False, return_indices=True))
 
 
 # The part of a gate that holds the target: networks are more accurate in a gate that is not much wider than that.

@@ -18,8 +18,7 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
-from spadwarp.denoise.classical import beliefs, highest, pooled
-from spadwarp.denoise.late_light import LIGHT, light_channels
+from spadwarp.denoise.classical import beliefs, deviation, highest, interpolated, log_likelihood, pooled
 
 CELL = 4
 """Bins of a cell."""
@@ -34,38 +33,9 @@ WINDOWS = (3, 7, 15)
 """Sides of the windows over which log-likelihoods are summed [pixels]."""
 
 _VOLUMES = 2 + len(WINDOWS)
-_CELLS, _IMAGES = _VOLUMES + 2, _VOLUMES + 3 + LIGHT  # channels of cells, and of images, that the pyramid sees
+_LIGHT = 14  # channels of `light_channels`
+_CELLS, _IMAGES = _VOLUMES + 2, _VOLUMES + 3 + _LIGHT  # channels of cells, and of images, that the pyramid sees
 _LEAST = 20.0  # differences of log-likelihoods within a pixel are clipped at this for the pyramid
-_LEAST_SIGNAL = 0.05  # counts
-_UNIFORM_SHARE = 0.3  # part of the signal that may come at any time, so that photons far from the return say little
-
-
-def toeplitz(response: Tensor, bins: int) -> Tensor:
-    """Response `[B, 2 r + 1]` in bin j to a return in bin k, `[B, j, k]`."""
-    radius = response.shape[-1] // 2
-    place = torch.arange(bins, device=response.device)
-    distance = place[:, None] - place
-    inside = distance.abs() <= radius
-    return torch.where(inside, response[:, (distance + radius).clamp(0, 2 * radius)], 0.0)
-
-
-def log_likelihood(counts: Tensor, background: Tensor, response: Tensor) -> Tensor:
-    """Log-likelihood ratio of a return in each bin, less what background alone gives on average, `[B, H, W, T]`.
-
-    Σ_j (n_j − B_j) ln(1 + S h_{j−k} / B'_j), so that dim pixels are not drawn to where background is high. S is the
-    mean signal of the frame, h the response, B' the background plus 0.3 S spread evenly over the gate. The sum over
-    pixels is that of the pixels together.
-
-    Args:
-        counts: Histograms over the gate, `[B, H, W, T]`.
-        background: Expected background counts, > 0, of each pixel `[B, H, W, T]` or the same for all `[B, 1, 1, T]`.
-        response: Instrument response per bin centred on its time zero, sum 1, `[B, 2 r + 1]`.
-    """
-    above, bins = counts - background, counts.shape[-1]
-    signal = above.sum(dim=-1).mean(dim=(1, 2)).clamp_min(_LEAST_SIGNAL)
-    floor = background.mean(dim=(1, 2)) + _UNIFORM_SHARE * signal[:, None] / bins
-    template = torch.log1p(signal[:, None, None] / floor[:, :, None] * toeplitz(response, bins))
-    return torch.bmm(above.flatten(1, 2), template).view_as(above)
 
 
 def rebinned(counts: Tensor, background: Tensor, response: Tensor, merged: int) -> tuple[Tensor, Tensor, Tensor]:
@@ -116,9 +86,6 @@ class _Conv(nn.Conv3d):
     """Convolution over cells, rows and columns `[B, N, H, W, n]`, by one over rows and columns of which cells beside
     each other are channels: several times faster, on a GPU too, than one over three dimensions."""
 
-    def __init__(self, before: int, after: int, length: int) -> None:
-        super().__init__(before, after, (3, 3, length))
-
     def forward(self, x: Tensor) -> Tensor:
         if self.kernel_size[2] == 1:
             return self._convolved(x)
@@ -141,9 +108,6 @@ class _Conv(nn.Conv3d):
 class _Shrink(nn.Conv3d):
     """Half as many rows, columns and, of `length` 2, cells, as a product of matrices."""
 
-    def __init__(self, before: int, after: int, length: int) -> None:
-        super().__init__(before, after, (2, 2, length))
-
     def forward(self, x: Tensor) -> Tensor:
         length = self.kernel_size[2]
         parts = x.unflatten(3, (-1, 2)).unflatten(2, (-1, 2)).unflatten(1, (-1, length))  # [B, N, ·, H, 2, W, 2, n]
@@ -153,9 +117,6 @@ class _Shrink(nn.Conv3d):
 
 class _Enlarge(nn.ConvTranspose3d):
     """Twice as many rows, columns and, of `length` 2, cells; as `_Shrink`."""
-
-    def __init__(self, before: int, after: int, length: int) -> None:
-        super().__init__(before, after, (2, 2, length))
 
     def forward(self, x: Tensor) -> Tensor:  # type: ignore[override]
         filters = self.weight.permute(0, 4, 2, 3, 1).flatten(1)
@@ -167,7 +128,7 @@ class _Enlarge(nn.ConvTranspose3d):
 class _Residual(nn.Module):
     def __init__(self, width: int, length: int) -> None:
         super().__init__()
-        self.layers = nn.ModuleList(_Conv(width, width, length) for _ in range(2))
+        self.layers = nn.ModuleList(_Conv(width, width, (3, 3, length)) for _ in range(2))
         nn.init.zeros_(self.layers[-1].weight)  # type: ignore[arg-type]  # begins as the identity
 
     def forward(self, x: Tensor) -> Tensor:
@@ -183,10 +144,10 @@ class _Pyramid(nn.Module):
     def __init__(self, widths: tuple[int, ...], *, volumes: bool) -> None:
         super().__init__()
         pairs, length, side = list(pairwise(widths)), 3 if volumes else 1, 2 if volumes else 1
-        self.down = nn.ModuleList(_Shrink(wide, narrow, side) for wide, narrow in pairs)
+        self.down = nn.ModuleList(_Shrink(wide, narrow, (2, 2, side)) for wide, narrow in pairs)
         self.before = nn.ModuleList(_Residual(width, length) for width in widths[1:])
         self.deep = _Residual(widths[-1], length)
-        self.up = nn.ModuleList(_Enlarge(narrow, wide, side) for wide, narrow in pairs)
+        self.up = nn.ModuleList(_Enlarge(narrow, wide, (2, 2, side)) for wide, narrow in pairs)
         self.after = nn.ModuleList(_Residual(width, length if level else 1) for level, width in enumerate(widths[:-1]))
         self.stride, self.side = 2 ** len(pairs), side
 
@@ -215,13 +176,13 @@ class HistogramNet(nn.Module):
     ) -> None:
         super().__init__()
         first = widths[0]
-        self.enter = _Conv(_CELLS, first, 1)
+        self.enter = _Conv(_CELLS, first, (3, 3, 1))
         self.enter_image = nn.Sequential(
             nn.Conv2d(_IMAGES, 32, 3, padding=1), nn.ReLU(), nn.Conv2d(32, first, 3, padding=1)
         )
         self.pyramid = _Pyramid(widths, volumes=True)
         self.head = nn.Linear(first, _VOLUMES + 1)
-        self.enter_target = _Conv(2 * first + _IMAGES, target_widths[0], 1)
+        self.enter_target = _Conv(2 * first + _IMAGES, target_widths[0], (3, 3, 1))
         self.target_pyramid = _Pyramid(target_widths, volumes=False)
         self.target = nn.Linear(target_widths[0], 1)
         self.stride = self.pyramid.stride
@@ -279,8 +240,7 @@ class HistogramNet(nn.Module):
         profile = 0.25 * (profile / profile.mean(dim=-1, keepdim=True)).log()
         cells = torch.stack([*scores, 0.4 * torch.asinh(excess), profile.expand_as(above)], dim=1)
         total, around = above.sum(dim=-1), level.sum(dim=-1).expand(above.shape[:-1])
-        offset = torch.arange(response.shape[-1], device=response.device) - response.shape[-1] // 2
-        width = (response * offset.square()).sum(dim=-1).clamp_min(0.1).sqrt()[:, None, None]
+        width = deviation(response, 0.1)[:, None, None]
         images = [
             *(0.3 * torch.asinh(top) for top in tops),
             0.2 * (total.clamp_min(0.0) + 0.3).log(),
@@ -309,6 +269,73 @@ def filled_up(image: Tensor, stride: int) -> Tensor:
             place = torch.arange(length + -length % stride, device=image.device) % period
             image = image.index_select(axis, torch.minimum(place, period - place))
     return image
+
+
+# What tells light that water scattered forward, beside a bright target, from a dim target. Both have the depth of a
+# target and far more counts than backscatter. The scattered light is a few per cent as bright as the target beside it,
+# and later: less of it arrives within the instrument response around its peak.
+
+_NEAR, _FAR = 10, 30  # pixels within which the brightest neighbourhood is looked for
+_WINDOWS = 3, 7  # sides of the windows whose counts are summed [pixels]
+_REACHES = 2.0, 8.0  # half widths around the peak, in deviations of the instrument response
+
+
+def light_channels(above: Tensor, background: Tensor, place: Tensor, response: Tensor) -> list[Tensor]:
+    """Brightness and lateness of the light of each pixel, `_LIGHT` times `[B, H, W]`.
+
+    Logarithms of the excess over the background: of 3 × 3 pixels, relative to the background, and relative to the
+    brightest 3 × 3 pixels around; the same of the pixel alone. Then the parts of the excess near the peak, in a wider
+    interval around it, and after that, over 3 × 3 and 7 × 7 pixels; and the differences of these from the means around
+    the pixel, in which bright pixels count most.
+
+    `above`: counts less the expected background, `[B, H, W, T]`; `background`: of each bin, mean over the frame,
+    `[B, T]`; `place`: of each pixel's peak over the gate; `response`: `[B, 2 r + 1]`, sum 1.
+    """
+    level = background.sum(dim=-1)[:, None, None]
+    excess = above.sum(dim=-1)
+    bright = _around(excess, 3).clamp_min(0.0)
+    most = [_brightest(bright, reach) for reach in (_NEAR, _FAR)]
+    parts = _near_and_late(above, place, response)
+    wide = [_around(part, side) for side in _WINDOWS for part in (excess, *parts)]
+    shares = []
+    for number, side in enumerate(_WINDOWS):
+        whole, *some = wide[4 * number : 4 * number + 4]
+        noise = (whole.clamp_min(0.0) + level + 0.5).sqrt() / side
+        shares += [(part / (whole.clamp_min(0.0) + noise)).clamp(-1.0, 2.0) for part in some]
+    weight = bright.square() + 1e-6
+    far = 2 * _FAR + 1
+    total = _around(weight, far)
+    typical = [_around(weight * share, far) / total for share in shares[3:]]
+    own = excess.clamp_min(0.0)
+    return [
+        0.2 * (bright + 0.1).log(),
+        0.2 * ((bright + 0.3) / (level + 0.3)).log(),
+        *(0.3 * ((bright + 0.2) / (one + 0.2)).log() for one in most),
+        0.3 * ((own + 1.0) / (most[1] + 1.0)).log(),
+        *shares,
+        *(share - one for share, one in zip(shares[3:], typical, strict=True)),
+    ]
+
+
+def _near_and_late(above: Tensor, place: Tensor, response: Tensor) -> list[Tensor]:
+    """Excess within the nearer and the farther of `_REACHES` around the peak, and after the farther, `[B, H, W]`."""
+    bins = above.shape[-1]
+    width = deviation(response, 0.25)[:, None, None]
+    cumulative, centre = above.cumsum(dim=-1), place * bins
+    edges = [centre + sign * (reach * width + 0.5) for reach in _REACHES for sign in (-1.0, 1.0)]
+    first, last, start, stop = interpolated(F.pad(cumulative, (1, 0)), torch.stack(edges, dim=-1)).unbind(dim=-1)
+    return [last - first, stop - start, cumulative[..., -1] - stop]
+
+
+def _brightest(image: Tensor, reach: int) -> Tensor:
+    """The highest value up to `reach` pixels away in rows and columns."""
+    side = 2 * reach + 1
+    highest = F.max_pool2d(image[:, None], (side, 1), 1, (reach, 0))
+    return F.max_pool2d(highest, (1, side), 1, (0, reach))[:, 0]
+
+
+def _around(image: Tensor, side: int) -> Tensor:
+    return pooled(image[..., None], side)[..., 0]
 
 
 def _interpolation(cells: int, bins: int, device: torch.device) -> Tensor:

@@ -7,28 +7,22 @@ import warnings
 from collections.abc import Callable
 from itertools import product
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, NamedTuple, get_args
+from typing import TYPE_CHECKING, Any, Literal, NamedTuple, get_args
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from spadwarp.denoise.baselines import BASELINES, CLASSICAL, MEDIAN_WINDOWS, classical_depth, median_filter
-from spadwarp.denoise.frames import (
-    MARGIN,
-    DepthFrames,
-    checked_gate,
-    depth_frames,
-    depth_values,
-    narrowed_input,
-)
-from spadwarp.denoise.histograms import histogram_tensors, merged_bins, target_bins, without_defects
-from spadwarp.denoise.network_files import MODELS, Precision, fast_precision, load_network, require_torch, torch_device
+from spadwarp.arrays import on_host, real_array
+from spadwarp.denoise.baselines import BASELINES, CLASSICAL, FROM_COUNTS, METHODS, median_filter
+from spadwarp.denoise.frames import DepthFrames, checked_gate, depth_frames, depth_values, narrowed_input
+from spadwarp.denoise.histograms import CountFrames, count_frames, merged_bins, target_bins, without_defects
+from spadwarp.denoise.network_files import Precision, fast_precision, require_torch, torch_device
 from spadwarp.frames.backgrounds import BackgroundLaw, profile_of_depth
 from spadwarp.frames.depth import arrival_time
 from spadwarp.frames.response import FWHM_PER_SIGMA, InstrumentResponse
 from spadwarp.values import ArgumentError, SpadwarpWarning, check_choice, check_real
 
-__all__ = ["METHODS", "Estimate", "apply", "estimate"]
+__all__ = ["METHODS", "Estimate", "estimate", "second_return"]
 
 
 if TYPE_CHECKING:
@@ -38,9 +32,6 @@ if TYPE_CHECKING:
 _WATER = -2.2  # logits below it, and above 0, are sure enough to count how pixels of water, and of the target, report
 _PRIOR = 30.0  # pixels of the target whose reports are assumed to be as those of the water
 _LARGEST = 3.0  # correction of a logit
-
-METHODS = (*MODELS, *(name for name in BASELINES if name != "input"), *CLASSICAL)
-"""Models of `apply`."""
 
 _ROWS = 64  # whose counts are summed at once: little memory
 _PIXELS_AT_ONCE = {"cpu": 1 << 16, "cuda": 1 << 23}  # a batch that fits into a CPU's cache is faster
@@ -62,32 +53,9 @@ class Estimate(NamedTuple):
     `spadwarp.arrival_time`. None without counts."""
 
     def masked(self, probability: float) -> NDArray[np.float32]:
-        """Depth, NaN where a target is less probable than `probability`."""
+        """Depth, NaN where a target is less probable than `probability`; 0.5 makes as few errors as possible."""
+        probability = check_real("mask", probability, "[0, 1]")
         return np.where(self.target_probability >= probability, self.depth, np.float32(np.nan))
-
-
-def apply(
-    depth: ArrayLike, *, gate: tuple[float, float], mask: float | None = None, **options: Any
-) -> NDArray[np.float32]:
-    """Denoises depth frames.
-
-    Args:
-        depth: `[H, W]` or `[N, H, W]` [m], planar depth or range; NaN and 0 mean that nothing was reported.
-        gate: (start, stop) of the camera's gate, in depth or range as `depth` is [m]. Distances need not be those of
-            the training: networks see depth over the gate, or over the part of it that holds the target.
-        mask: Pixels that see a target with less than this probability become NaN; by default every pixel has a depth,
-            also where there is only water. 0.5 makes as few errors as possible.
-        options: The other arguments of `estimate`.
-
-    Returns:
-        float32 of `depth`'s shape [m]. A frame without any report stays empty.
-
-    Raises:
-        ArgumentError, SpadwarpError: See `estimate`.
-    """
-    mask = None if mask is None else check_real("mask", mask, "[0, 1]")
-    found = estimate(depth, gate=gate, **options)
-    return found.depth if mask is None else found.masked(mask)
 
 
 def estimate(
@@ -105,10 +73,12 @@ def estimate(
     precision: Precision | None = None,
     progress: Callable[[str, int, int], None] | None = None,
 ) -> Estimate:
-    """Depth, and the probabilities that a pixel sees a target and that its depth is right.
+    """Denoises depth frames: depth, and the probabilities that a pixel sees a target and that its depth is right.
 
     Args:
-        depth, gate: See `apply`.
+        depth: `[H, W]` or `[N, H, W]` [m], planar depth or range; NaN and 0 mean that nothing was reported.
+        gate: (start, stop) of the camera's gate, in depth or range as `depth` is [m]. Distances need not be those of
+            the training: networks see depth over the gate, or over the part of it that holds the target.
         model: "pyramid", "dncnn" or "usdn"; or a baseline: "median", "gating", "bm3d". With counts, "pyramid" means
             "histograms", the network that uses them; "likelihood", "pooled", "semi-global",
             "total-variation" and "belief-propagation" are classical estimates from counts.
@@ -140,53 +110,37 @@ def estimate(
     gate, depth = checked_gate(gate), depth_values(depth)
     if precision is not None:
         check_choice("precision", precision, get_args(Precision))
-    if model not in ("histograms", *CLASSICAL):
-        if profile is None and model in ("pyramid", "gating"):
-            profile = profile_of_depth(depth, gate)
-        frames = depth_frames(depth, gate=gate, profile=profile)
-        found = estimate_frames(
-            frames, model=model, weights=weights, device=device, precision=precision, progress=progress
-        )
+    if model not in FROM_COUNTS:
+        options: dict[str, Any] = {"weights": weights, "device": device, "precision": precision, "progress": progress}
+        found = estimate_depth(depth, gate=gate, model=model, profile=profile, **options)
     else:
         if counts is None or response is None:
             raise ArgumentError(f"model = {model!r} needs counts and response, of which some are missing")
-        cubes, levels, taps, defects, _ = without_defects(counts, background, response)
-        if depth.shape != cubes.shape[:-1]:
-            raise ArgumentError(f"depth has shape {depth.shape}; {cubes.shape[:-1]} is needed, that of counts")
+        frames = without_defects(counts, background, response)
+        if depth.shape != frames.counts.shape[:-1]:
+            raise ArgumentError(f"depth has shape {depth.shape}; {frames.counts.shape[:-1]} is needed, that of counts")
         if model in CLASSICAL and weights is not None:
             raise ArgumentError(f"weights are for a network, not for {model!r}")
-        if defects is not None:
-            warnings.warn(defects.summary, SpadwarpWarning, stacklevel=2)
-            depth = np.where(defects.hide(depth, gate, taps.size), np.float32(np.nan), depth)
-        first, stop, part = target_bins(cubes, levels, taps, gate)
-        if model not in CLASSICAL and _leaves_frames_empty(depth, gate, part):
-            first, stop, part = 0, cubes.shape[-1], gate
+        if frames.defects is not None:
+            warnings.warn(frames.defects.summary, SpadwarpWarning, stacklevel=2)
+            hidden = frames.defects.hide(depth, gate, frames.response.size)
+            depth = np.where(hidden, np.float32(np.nan), depth)
+        bins, width = target_bins(frames), (gate[1] - gate[0]) / frames.counts.shape[-1]
+        start, stop = gate[0] + bins.start * width, gate[0] + bins.stop * width
 
         def to_depth(place: NDArray[np.float32]) -> NDArray[np.float32]:
-            return part[0] + (part[1] - part[0]) * place
+            return start + (stop - start) * place
 
-        found = estimate_histograms(
-            depth, cubes, levels, taps, bins=slice(first, stop), gate=part, model=model, to_depth=to_depth,
-            weights=weights, device=device,
-        )  # fmt: skip
-        given: dict[str, Any] = {"min_significance": min_significance, "level_known": not isinstance(background, str)}
-        found = detected(found, cubes, levels, taps, model=model, **given)
+        options = {"bins": bins, "bin_width": width, "to_depth": to_depth, "weights": weights, "device": device}
+        found = estimate_histograms(depth, frames, model=model, **options)
+        found = detected(found, frames, model=model, min_significance=min_significance)
     shaped: Any = (None if values is None else values.reshape(np.shape(depth)) for values in found)
     return Estimate(*shaped)
 
 
-def detected(
-    found: Estimate,
-    counts: NDArray[Any],
-    background: NDArray[Any],
-    response: NDArray[Any],
-    *,
-    model: str,
-    min_significance: float,
-    level_known: bool = True,
-) -> Estimate:
+def detected(found: Estimate, given: CountFrames, *, model: str, min_significance: float) -> Estimate:
     """`found` with the significance of the counts, and neither depth nor target below the least; of rates as it is."""
-    least = check_real("min_significance", min_significance, "[0, 1000]")
+    least, counts = check_real("min_significance", min_significance, "[0, 1000]"), given.counts
     if counts.dtype.kind not in "biu" and not np.array_equal(counts, np.rint(counts)):
         return found
     side = 1 if model == "likelihood" else 7
@@ -202,20 +156,20 @@ def detected(
         return cube
 
     frames = counts.reshape(-1, *counts.shape[-3:])
-    known, height = np.asarray(background, np.float64), frames.shape[1]
+    known, height = np.asarray(given.background, np.float64), frames.shape[1]
     significance = np.empty(frames.shape[:-1], np.float32)
-    options: dict[str, Any] = {"level_known": level_known, "device": "cpu"}
-    half = np.flatnonzero(response >= 0.5 * np.max(response))
+    options: dict[str, Any] = {"level_known": given.level_known, "device": "cpu"}
+    half = np.flatnonzero(given.response >= 0.5 * np.max(given.response))
     width = (half[-1] - half[0] + 1) * (1.0 - 1e-9)  # bins, and not one more by rounding
     options["irf"] = InstrumentResponse(sigma=width * 1e-12 / FWHM_PER_SIGMA)
     for top in range(0, height, _ROWS):
         first, stop = max(0, top - side // 2), top + _ROWS + side // 2
         inner = slice(top - first, top - first + _ROWS)
         if known.ndim == 1:
-            pixels = summed(np.ones((*frames[0, first:stop].shape[:2], 1)))[inner]
-            options["background"] = np.maximum(pixels * known, 0.0)
+            level = known * summed(np.ones((*frames[0, first:stop].shape[:2], 1)))
         else:
-            options["background"] = np.maximum(summed(known[first:stop])[inner], 0.0)
+            level = summed(known[first:stop])
+        options["background"] = np.maximum(level[inner], 0.0)
         for cube, image in zip(frames, significance, strict=True):
             some, out = summed(cube[first:stop].astype(np.int64))[inner], image[top : top + _ROWS]
             arrival_time(some, gate_start=0.0, bin_width=1e-12, significance=out, **options)
@@ -230,32 +184,38 @@ _COARSE = 0.76  # part of the light in one bin, from which on the FWHM of a Gaus
 
 def estimate_histograms(
     depth: NDArray[Any],
-    counts: NDArray[Any],
-    background: NDArray[np.float32],
-    response: NDArray[Any],
+    frames: CountFrames,
     *,
     bins: slice,
-    gate: tuple[float, float],
+    bin_width: float,
     model: str,
     to_depth: Callable[[NDArray[np.float32]], NDArray[Any]],
     weights: str | Path | None,
     device: str | None,
 ) -> Estimate:
-    """`estimate` for the methods that use counts, in the bins that hold the target; `gate` is theirs."""
-    given: dict[str, Any] = {"background": background[..., bins], "response": response, "device": device}
+    """`estimate` for the methods that use counts, in the bins that hold the target; `bin_width` is in depth [m]."""
+    require_torch()
+    from spadwarp.denoise.classical import classical_depth
+
+    frames = frames.part(bins)
     if model in CLASSICAL:
-        place = classical_depth(counts[..., bins], method=model, **given)  # type: ignore[arg-type]
+        place = classical_depth(frames, method=model, device=device)  # type: ignore[arg-type]
         found = np.stack([place, np.ones_like(place), np.full_like(place, np.nan)])
     else:
-        found = _by_network(counts[..., bins], weights=weights, **given)
-        empty = ~((depth > 0) & np.isfinite(depth)).reshape(found.shape[1:]).any(axis=(1, 2))
-        found[0, empty], found[1, empty] = np.nan, 0.0
+        found = _empty_where(depth, _by_network(frames, weights, device))
     found[0] = to_depth(found[0])
     found = found.reshape(3, *depth.shape)
+    response = frames.response
     if np.max(response) >= _COARSE * np.sum(response):  # histograms tell no place within a bin; the pixel's light does
-        near = np.abs(depth - found[0]) < (gate[1] - gate[0]) / (bins.stop - bins.start)
-        found[0] = np.where(near, depth, found[0])
+        found[0] = np.where(np.abs(depth - found[0]) < bin_width, depth, found[0])
     return Estimate(*found)
+
+
+def _empty_where(depth: NDArray[Any], found: NDArray[np.float32]) -> NDArray[np.float32]:
+    """The arrays of an `Estimate`, `[3, N, H, W]`, without depth and target in frames without any report."""
+    empty = ~((depth > 0) & np.isfinite(depth)).reshape(found.shape[1:]).any(axis=(1, 2))
+    found[0, empty], found[1, empty] = np.nan, 0.0
+    return found
 
 
 _MARGIN = 32  # pixels around a part of a large frame that are seen, too
@@ -263,34 +223,31 @@ _AT_ONCE = 7 << 20  # bins of all pixels that are computed at once: in float32 l
 _LEAST_PART = 96  # pixels of a side: smaller parts would see more of others than of their own
 
 
-def _parts(length: int, most: int) -> list[tuple[slice, slice]]:
-    """A side in equal parts of at most so many pixels: what is answered, and what is seen for it."""
+def _parts(length: int, most: int) -> list[tuple[slice, slice, slice]]:
+    """A side in equal parts of at most so many pixels: what is answered, what is seen for it, and where in this."""
     count = -(-length // most)
     step = -(-length // (16 * count)) * 16  # whole strides of the network
-    firsts = range(0, length, step)
-    return [(slice(one, one + step), slice(max(0, one - _MARGIN), one + step + _MARGIN)) for one in firsts]
+    parts = [(first, max(0, first - _MARGIN), first + step) for first in range(0, length, step)]
+    return [(slice(one, stop), slice(low, stop + _MARGIN), slice(one - low, stop - low)) for one, low, stop in parts]
 
 
-def _by_network(
-    counts: NDArray[Any], *, background: NDArray[Any], response: NDArray[Any], weights: Any, device: str | None
-) -> NDArray[np.float32]:
+def _by_network(given: CountFrames, weights: str | Path | None, device: str | None) -> NDArray[np.float32]:
     """Depth over the gate, target probability and confidence, `[3, N, H, W]`."""
     torch = require_torch()
     from spadwarp.denoise.histogram_network import answer, rebinned
+    from spadwarp.denoise.networks import load_network
 
-    frames = counts.reshape(-1, *counts.shape[-3:])
+    frames, level = given.counts.reshape(-1, *given.counts.shape[-3:]), given.background
     height, width, bins = frames.shape[1:]
     found = np.empty((3, *frames.shape[:3]), np.float32)
-    network, merged = load_network("histograms", weights, str(torch_device(device))), merged_bins(bins, response)
+    network, merged = load_network("histograms", weights, str(torch_device(device))), merged_bins(bins, given.response)
     most = max(_LEAST_PART, math.isqrt(_AT_ONCE * merged // bins) - 2 * _MARGIN)
     with torch.inference_mode():
-        for (rows, seen_rows), (columns, seen_columns) in product(_parts(height, most), _parts(width, most)):
-            part = np.s_[..., seen_rows, seen_columns, :]
-            level = background[part] if background.ndim == 3 else background
-            given = histogram_tensors(frames[part], level, response, device)
-            sides = (rows, seen_rows), (columns, seen_columns)
-            inner = tuple(slice(one.start - seen.start, one.stop - seen.start) for one, seen in sides)
-            for image, (cube, known, taps) in zip(found.swapaxes(0, 1), given, strict=True):
+        parts = product(_parts(height, most), _parts(width, most))
+        for (rows, seen_rows, inner_rows), (columns, seen_columns, inner_columns) in parts:
+            seen = np.s_[..., seen_rows, seen_columns, :]
+            part = given._replace(counts=frames[seen], background=level[seen] if level.ndim == 3 else level)
+            for image, (cube, known, taps) in zip(found.swapaxes(0, 1), part.tensors(device), strict=True):
                 if merged > 1:
                     cube, known, taps = rebinned(cube, known, taps, merged)
                 probability, target = network(cube, known, taps)
@@ -298,20 +255,8 @@ def _by_network(
                 depth *= merged * cube.shape[-1] / bins  # the last of merged bins may reach beyond the gate
                 depth += 0.5 * (merged % 2 == 0) / bins  # an even number has no middle: the response is the next's
                 answers = torch.cat([depth, target.sigmoid(), confidence])
-                image[:, rows, columns] = answers[:, *inner].cpu().numpy()
+                image[:, rows, columns] = answers[:, inner_rows, inner_columns].cpu().numpy()
     return found
-
-
-def _leaves_frames_empty(depth: NDArray[Any], gate: tuple[float, float], part: tuple[float, float]) -> bool:
-    """Whether a frame has reports near the gate, but none near this part of it."""
-
-    def reports(start: float, stop: float) -> NDArray[np.bool_]:
-        margin = MARGIN * (stop - start)
-        with np.errstate(invalid="ignore"):
-            near = (depth > 0) & (depth >= start - margin) & (depth <= stop + margin)
-        return np.asarray(near.any(axis=(-2, -1)))
-
-    return bool((reports(*gate) & ~reports(*part)).any())
 
 
 def target_threshold(model: str) -> float:
@@ -321,10 +266,13 @@ def target_threshold(model: str) -> float:
     return 0.08 if model == "pyramid" else 0.5
 
 
-def denoise_frames(frames: DepthFrames, *, model: str, **options: Any) -> tuple[NDArray[np.float32], NDArray[np.bool_]]:
-    """Depth of every pixel [m], and where a target is seen (`target_threshold`): float32 and bool `[N, H, W]`."""
-    found = estimate_frames(frames, model=model, **options)
-    return found.depth, found.target_probability >= target_threshold(model)
+def estimate_depth(
+    depth: NDArray[np.float32], *, gate: tuple[float, float], model: str, profile: ArrayLike | None, **options: Any
+) -> Estimate:
+    """`estimate` for the methods that use depth alone; `options`: of `estimate_frames`."""
+    if profile is None and model in ("pyramid", "gating"):
+        profile = profile_of_depth(depth, gate)
+    return estimate_frames(depth_frames(depth, gate=gate, profile=profile), model=model, **options)
 
 
 def estimate_frames(
@@ -339,24 +287,26 @@ def estimate_frames(
 ) -> Estimate:
     """`estimate` for frames `[N, H, W]`.
 
-    `model` may also be "input", the frames as they are; `window`: side of the median [pixels]. Networks without an
+    `model` may also be "input", the frames as they are; `window`: side of the median, odd [pixels]. Networks without an
     answer of their own for a pixel give it the gate's end.
     """
     if model != "input":
         check_choice("model", model, METHODS)
     if precision is not None:
         check_choice("precision", precision, get_args(Precision))
-    if model in ("histograms", *CLASSICAL):
+    if model in FROM_COUNTS:
         raise ArgumentError(f"model = {model!r} needs counts with their background and response; they are missing")
     if model in BASELINES:
         return _baseline(frames, model, window, weights)
     torch = require_torch()
+    from spadwarp.denoise.networks import load_network
+
     place = torch_device(device)
     if model != "pyramid":
         precision = "float32"
     kind = precision or fast_precision(str(place))
     network = load_network(model, weights, str(place), kind)
-    inputs = None if model == "pyramid" else frames.network_input()
+    inputs = None if model == "pyramid" else frames.filled()[:, None]
     begin, extent = frames.gate[0], frames.gate[1] - frames.gate[0]
     part = max(1, _PIXELS_AT_ONCE[place.type] // frames.depth[0].size)
     answers, finite = torch.empty(3, *frames.depth.shape), True
@@ -380,30 +330,23 @@ def estimate_frames(
             probability, confidence = reported.float(), torch.full_like(found, torch.nan)
             if output.shape[1] > 1:
                 probability, confidence = output[:, 1:3].sigmoid_().unbind(dim=1)
-            some_seen = reported.flatten(1).any(dim=1)[:, None, None]
-            answers[0, some] = torch.where(some_seen, found, torch.nan)
-            answers[1, some] = torch.where(some_seen, probability, 0.0)
-            answers[2, some] = confidence
+            answers[:, some] = torch.stack([found, probability, confidence])
         if progress is not None:
             progress("frames", min(first + part, len(frames.depth)), len(frames.depth))
     if not finite:  # values beyond the range of float16, or weights that are not finite
         if kind == "float32" or precision is not None:
             raise ArgumentError(f"precision = {kind!r}: the network {model!r} gave values that are not finite")
         return estimate_frames(frames, model=model, weights=weights, device=device, precision="float32")
-    return Estimate(*answers.numpy())
+    return Estimate(*_empty_where(frames.depth, answers.numpy()))
 
 
 def _baseline(frames: DepthFrames, model: str, window: int, weights: str | Path | None) -> Estimate:
     """`estimate_frames` for one of `BASELINES`."""
     if weights is not None:
         raise ArgumentError(f"weights are for a network, not for {model!r}")
-    if window < 1 or window % 2 == 0:
-        raise ArgumentError(f"window = {window} is not an odd number >= 1, such as {MEDIAN_WINDOWS}")
     found = median_filter(frames, window=window) if model == "median" else BASELINES[model](frames)
-    reported = ~np.isnan(frames.depth)
-    empty = ~reported.any(axis=(1, 2), keepdims=True)
-    found = np.where(empty, np.float32(np.nan), found)
-    return Estimate(found, reported.astype(np.float32), np.full_like(frames.depth, np.nan))
+    answers = np.stack([found, ~np.isnan(frames.depth), np.full_like(found, np.nan)]).astype(np.float32)
+    return Estimate(*_empty_where(frames.depth, answers))
 
 
 def corrected_target(logit: Tensor, depth: Tensor, reported: Tensor, share: Tensor) -> Tensor:
@@ -435,3 +378,58 @@ def corrected_target(logit: Tensor, depth: Tensor, reported: Tensor, share: Tens
     )
     logit = logit + torch.where(absent, of_absent, torch.where(beyond, of_beyond, 0.0))
     return logit + share.log().clamp_min(-_LARGEST)[:, None, None]
+
+
+_BY_CHANCE = 6.0  # log of the false second returns that are accepted, one in e^6 pixels
+
+
+def second_return(
+    depth: ArrayLike,
+    counts: ArrayLike,
+    *,
+    background: ArrayLike,
+    response: ArrayLike,
+    side: Literal[1, 3, 5, 7, 9] = 3,
+    device: str | None = None,
+) -> NDArray[np.float32]:
+    """Depth over the gate of a second return `[N, H, W]`; NaN where there is no significant one.
+
+    The first return is taken off each histogram: as many counts as lie in it, in the shape of the response. In what
+    remains, beyond the response, the counts of `side` × `side` pixels within the response's width have to exceed the
+    background by more than happens by chance in one of 400 pixels (Poisson likelihood ratio). Light that the water
+    scatters into a pixel from a brighter part of the target is such an excess, too: with hundreds of detections a pixel
+    most pixels have a second return.
+
+    Args:
+        depth: First return over the gate, 0 at its start and 1 at its end, `[H, W]` or `[N, H, W]`.
+        counts, background, response, device: See `estimate`, as for errors.
+        side: Of the window over which histograms are pooled; 1 for each pixel alone.
+    """
+    torch = require_torch()
+    from spadwarp.denoise.classical import deviation, highest, pooled, toeplitz
+
+    first, cubes = real_array("depth", depth), np.asarray(on_host(counts))
+    if first.shape != cubes.shape[:-1]:
+        raise ArgumentError(f"depth has shape {first.shape}; {cubes.shape[:-1]} is needed")
+    frames = first.reshape(-1, *first.shape[-2:])
+    found = []
+    with torch.inference_mode():
+        tensors = count_frames(cubes, background, response).tensors(device)
+        for place, (cube, level, taps) in zip(frames, tensors, strict=True):
+            bins = cube.shape[-1]
+            at = (torch.from_numpy(np.nan_to_num(place)).to(cube.device)[None] * bins).long().clamp(0, bins - 1)
+            width = float(deviation(taps, 0.1))
+            shape = toeplitz(taps, bins)[0].t()[at]  # of the first return in each pixel
+            near = (torch.arange(bins, device=cube.device) - at[..., None]).abs() <= 3.0 * width + 1.0
+            signal = ((cube - level) * near).sum(dim=-1, keepdim=True).clamp_min(0.0)
+            rest = torch.where(near, level.expand_as(cube), cube - signal * shape).clamp_min(0.0)
+            reach = 2 * round(1.5 * width) + 1
+            image = torch.cat([rest, level.expand_as(cube)])
+            image = pooled(image, side) * side**2
+            sums = torch.nn.functional.avg_pool1d(image.flatten(0, 2)[:, None], reach, 1, reach // 2)
+            found_counts, expected = (sums.view_as(image) * reach).split(1)
+            excess = torch.xlogy(found_counts, found_counts / expected) - (found_counts - expected)
+            score = torch.where(near | (found_counts <= expected), 0.0, excess)
+            significant = score.amax(dim=-1) > math.log(bins) + _BY_CHANCE
+            found.append(torch.where(significant, highest(score), math.nan)[0].cpu().numpy())
+    return np.stack(found).astype(np.float32)

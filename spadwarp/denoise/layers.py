@@ -45,16 +45,6 @@ def enlarged(image: Tensor, factor: int) -> Tensor:
     return _Enlarged.apply(image, factor)  # type: ignore[no-any-return, no-untyped-call]
 
 
-def edge_padded(image: Tensor, reach: int) -> Tensor:
-    """`[B, C, H, W]` with `reach` more pixels on each side, which have the values of the nearest."""
-    return _EdgePadded.apply(image, reach)  # type: ignore[no-any-return, no-untyped-call]
-
-
-def permuted(values: Tensor, places: Tensor, inverse: Tensor) -> Tensor:
-    """`values[..., places]`, for g permutations of n places `[g n]` with their inverses `[g, n]`."""
-    return _Permuted.apply(values, places, inverse)  # type: ignore[no-any-return, no-untyped-call]
-
-
 class _Enlarged(torch.autograd.Function):
     @staticmethod
     def forward(context: Any, image: Tensor, factor: int) -> Tensor:
@@ -70,49 +60,26 @@ class _Enlarged(torch.autograd.Function):
         parts = [(min(k, 2 * factor - 1 - k) + 0.5) / factor for k in range(2 * factor)]
         found = found.to(torch.promote_types(kind, torch.float32))
         for dim in (2, 3):
-            length = found.shape[dim]
-            first, last = found.narrow(dim, 0, half).flip(dim), found.narrow(dim, length - half, half).flip(dim)
-            mirrored = torch.cat([first, found, last], dim)
-            pieces = mirrored.unflatten(dim, (-1, factor))  # the parts of pixel i are in pieces i and i + 1
-            pieces = pieces.movedim(dim + 1, 0)
-            count, total = length // factor, None
-            for k, part in enumerate(parts):
-                one = pieces[k % factor].narrow(dim, k // factor, count)
-                total = one * part if total is None else torch.add(total, one, alpha=part, out=total)
-            assert total is not None
-            found = total
+            first, last = (found.narrow(dim, place, half).flip(dim) for place in (0, -half))
+            seen = torch.cat([first, found, last], dim).unfold(dim, 2 * factor, factor).unbind(dim=-1)
+            found = seen[0] * parts[0]
+            for part, one in zip(parts[1:], seen[1:], strict=True):
+                found.add_(one, alpha=part)
         return found.to(kind), None
 
 
-class _EdgePadded(torch.autograd.Function):
-    @staticmethod
-    def forward(context: Any, image: Tensor, reach: int) -> Tensor:
-        context.reach = reach
-        return F.pad(image, (reach,) * 4, mode="replicate")
-
-    @staticmethod
-    def backward(context: Any, *derivatives: Tensor) -> tuple[Tensor, None]:
-        (found,), reach = derivatives, context.reach
-        for dim in (2, 3):
-            length = found.shape[dim] - 2 * reach
-            inner = found.narrow(dim, reach, length).clone()
-            inner.narrow(dim, 0, 1).add_(found.narrow(dim, 0, reach).sum(dim, keepdim=True))
-            inner.narrow(dim, length - 1, 1).add_(found.narrow(dim, reach + length, reach).sum(dim, keepdim=True))
-            found = inner
-        return found, None
+def edge_padded(image: Tensor, reach: int) -> Tensor:
+    """`[B, C, H, W]` with `reach` more pixels on each side, which have the values of the nearest."""
+    for dim in (3, 2):
+        first, last = (image.narrow(dim, place, 1).repeat_interleave(reach, dim) for place in (0, -1))
+        image = torch.cat([first, image, last], dim)
+    return image
 
 
-class _Permuted(torch.autograd.Function):
-    @staticmethod
-    def forward(context: Any, values: Tensor, places: Tensor, inverse: Tensor) -> Tensor:
-        context.save_for_backward(inverse)
-        return values.index_select(-1, places)
-
-    @staticmethod
-    def backward(context: Any, *derivatives: Tensor) -> tuple[Tensor, None, None]:
-        (inverse,) = context.saved_tensors
-        found = derivatives[0].unflatten(-1, inverse.shape)
-        return found.gather(-1, inverse.expand_as(found)).sum(dim=-2), None, None
+def permuted(values: Tensor, places: Tensor) -> Tensor:
+    """`values[..., places]`, `[..., g, n]`, for g permutations `[g, n]`: no two derivatives go to the same place."""
+    shape = *values.shape[:-1], *places.shape
+    return values[..., None, :].expand(shape).gather(-1, places.expand(shape))
 
 
 GROUP = 8
@@ -127,29 +94,18 @@ def turned(image: NDArray[np.int64], element: int) -> NDArray[np.int64]:
 @lru_cache(maxsize=1)
 def _left_quotients() -> NDArray[np.int64]:
     """Index of g⁻¹ h for elements g and h, `[8, 8]`."""
-    probe = np.arange(9).reshape(3, 3)
-    images = [turned(probe, element).tolist() for element in range(GROUP)]
-    table = np.empty((GROUP, GROUP), np.int64)
-    for g in range(GROUP):
-        for other in range(GROUP):  # g ∘ other = h
-            product = turned(turned(probe, other), g).tolist()
-            table[g, images.index(product)] = other
-    return table
+    places = np.stack([turned(np.arange(9).reshape(3, 3), element).ravel() for element in range(GROUP)])
+    products = places[:, places]  # of each element, after each g
+    return (products[:, :, None] == places).all(axis=-1).argmax(axis=0)
 
 
 @lru_cache(maxsize=32)
 def _expansion(size: int, channels: Literal[1, 8]) -> Tensor:
-    """Places in a filter `[channels, size, size]` that the expanded one `[8, channels, size, size]` takes, flat."""
+    """Places in a flat filter `[channels, size, size]` that each of the eight takes, `[8, channels size²]`."""
     places = np.arange(channels * size * size).reshape(channels, size, size)
     quotients = _left_quotients()
     parts = [turned(places[quotients[g]] if channels == GROUP else places, g) for g in range(GROUP)]
-    return torch.from_numpy(np.ascontiguousarray(np.stack(parts))).flatten()
-
-
-def _remember(module: nn.Module, places: Tensor) -> None:
-    """Gives a module the buffers `places`, of `_expansion`, and `inverse`, which are not saved with its weights."""
-    module.register_buffer("places", places.clone(), persistent=False)
-    module.register_buffer("inverse", places.view(GROUP, -1).argsort(dim=1), persistent=False)
+    return torch.from_numpy(np.stack(parts)).flatten(1)
 
 
 class SymmetricConv(nn.Module):
@@ -157,6 +113,8 @@ class SymmetricConv(nn.Module):
 
     With a stride of 2 the symmetry is kept only for filters and images of even sides.
     """
+
+    places: Tensor  # which are not saved with the weights
 
     def __init__(
         self, inputs: int, outputs: int, size: int, *, stride: int = 1, lifts: bool = False, bias: bool = True
@@ -167,17 +125,14 @@ class SymmetricConv(nn.Module):
         self.weight = nn.Parameter(torch.empty(outputs, inputs, channels * size * size))
         nn.init.normal_(self.weight, std=(2.0 / (inputs * channels * size * size)) ** 0.5)
         self.bias = nn.Parameter(torch.zeros(outputs)) if bias else None
-        _remember(self, _expansion(size, channels))
+        self.register_buffer("places", _expansion(size, channels), persistent=False)
         self._kept: Tensor | None = None
 
     def expanded(self) -> Tensor:
         """The filters of an ordinary convolution, `[8 outputs, inputs, size, size]`."""
         if self._kept is not None and not torch.is_grad_enabled():
             return self._kept
-        assert isinstance(self.places, Tensor) and isinstance(self.inverse, Tensor)
-        outputs, inputs = self.weight.shape[:2]
-        shape = (outputs, inputs, GROUP, -1, self.size, self.size)
-        filters = permuted(self.weight, self.places, self.inverse).view(shape)
+        filters = permuted(self.weight, self.places).unflatten(-1, (-1, self.size, self.size))
         filters = filters.transpose(1, 2).flatten(2, 3).flatten(0, 1)
         if torch.is_grad_enabled() or self.training:
             return filters
@@ -196,6 +151,9 @@ class SymmetricConv(nn.Module):
 class SymmetricWindow(nn.Module):
     """Values for the places of a `side` × `side` window around each pixel, which turn with the image."""
 
+    places: Tensor
+    classes: Tensor  # of places with the same bias
+
     def __init__(self, inputs: int, side: int) -> None:
         super().__init__()
         self.weight = nn.Parameter(torch.randn(inputs, side * side) * (0.3 / (GROUP * inputs) ** 0.5))
@@ -204,14 +162,11 @@ class SymmetricWindow(nn.Module):
         _, index = torch.unique(classes.flatten(1), dim=1, return_inverse=True)
         self.bias = nn.Parameter(torch.zeros(int(index.max()) + 1))
         self.register_buffer("classes", index, persistent=False)
-        _remember(self, _expansion(side, 1))
+        self.register_buffer("places", _expansion(side, 1), persistent=False)
 
     def filters(self) -> tuple[Tensor, Tensor]:
         """Weights `[side², 8 inputs]` and biases `[side²]` of a layer of 1 × 1 pixels."""
-        assert isinstance(self.places, Tensor) and isinstance(self.inverse, Tensor)
-        assert isinstance(self.classes, Tensor)
-        inputs, area = self.weight.shape
-        weight = permuted(self.weight, self.places, self.inverse).view(inputs * GROUP, area)
+        weight = permuted(self.weight, self.places).flatten(0, 1)
         chosen = self.classes[:, None] == torch.arange(len(self.bias), device=self.bias.device)
         return weight.t(), (chosen * self.bias).sum(dim=1)
 

@@ -1,17 +1,16 @@
-"""Networks with their weights, from the package or from files of `spadwarp train`, and the torch that runs them."""
+"""Files of networks' weights, of the package or of `spadwarp train`, and the torch that runs the networks."""
 
 from __future__ import annotations
 
 import re
 import sys
 from collections.abc import Sequence
-from functools import lru_cache
 from pathlib import Path
 from typing import Any, Literal
 
 from spadwarp.io.paths import existing_file
 from spadwarp.io.text import parse_json
-from spadwarp.values import ArgumentError, DeviceError, FileError, SpadwarpError, need_memory, shown
+from spadwarp.values import ArgumentError, DeviceError, FileError, SpadwarpError, check_choice, need_memory, shown
 
 __all__ = ["weights_metadata"]
 
@@ -31,42 +30,13 @@ def weights_metadata(model: str, weights: str | Path | None = None) -> dict[str,
 
     `weights`: the file; default: the package's for `model`. Raises `FileError`; `ArgumentError` for an unknown model.
     """
-    path = _weights_path(model, weights)
+    path = weights_path(model, weights)
     try:
-        return {name: parse_json(text) if text[:1] in ("{", "[") else text for name, text in _header(path).items()}
+        return {
+            name: parse_json(text) if text[:1] in ("{", "[") else text for name, text in weights_header(path).items()
+        }
     except ValueError as error:
         raise FileError(f"{path}: its header is damaged: {error}") from error
-
-
-@lru_cache(maxsize=8)
-def load_network(
-    model: str, weights: str | Path | None = None, device: str = "cpu", precision: Precision = "float32"
-) -> Any:
-    """A network with its weights, ready to run; `precision`: of the layers of PyramidNet."""
-    torch = require_torch()
-    from safetensors.torch import load_file
-
-    from spadwarp.denoise.networks import build_network
-
-    path = _weights_path(model, weights)
-    named = _header(path).get("model", model)
-    if named != model:
-        raise FileError(f"{path}: weights of {named!r}, not of {model!r}")
-    try:
-        network: Any = build_network(model)
-        values = {name: value.float() for name, value in load_file(path).items()}  # counters are cast back
-        network.load_state_dict(values)
-        if wrong := [name for name, value in values.items() if not torch.isfinite(value).all()]:
-            raise ValueError(f"{wrong[0]} is not finite")
-    except Exception as error:  # safetensors and torch have errors of their own
-        raise FileError(f"{path}: not weights of {model!r}: {error}") from error
-    # glibc returns memory to the system after each layer, and fresh pages take as long as the layer, unless a block
-    # this large (at most 32 MiB) was freed before: M_TRIM_THRESHOLD in mallopt(3).
-    torch.empty(31 << 20, dtype=torch.uint8)
-    network = network.to(torch.device(device), getattr(torch, precision))
-    if model != "histograms":
-        network = network.to(memory_format=torch.channels_last)
-    return network.eval().requires_grad_(False)
 
 
 def fast_precision(device: str) -> Precision:
@@ -85,7 +55,7 @@ def compared(models: Sequence[str], weights: str | Path | None, *, counts: bool 
     methods: dict[str, dict[str, Any]] = {name: {"model": name, "weights": None} for name in models}
     if weights is None:
         return methods
-    model = _header(existing_file(weights)).get("model")
+    model = weights_header(existing_file(weights)).get("model")
     if model not in MODELS:
         raise FileError(f"{weights}: not weights of spadwarp train: its header names no network")
     if model == "histograms" and not counts:
@@ -119,13 +89,13 @@ def torch_device(name: str | None) -> Any:
     return torch.device(name)
 
 
-def _weights_path(model: str, weights: str | Path | None) -> Path:
-    if model not in MODELS:
-        raise ArgumentError(f"model = {model!r} is not one of {', '.join(map(repr, MODELS))}")
+def weights_path(model: str, weights: str | Path | None) -> Path:
+    """The file, or the package's for `model`."""
+    check_choice("model", model, MODELS)
     return existing_file(WEIGHTS / f"{model}.safetensors" if weights is None else weights)
 
 
-def _header(path: Path) -> dict[str, str]:
+def weights_header(path: Path) -> dict[str, str]:
     """Metadata in the header of a safetensors file."""
     require_torch()
     from safetensors import SafetensorError, safe_open

@@ -12,15 +12,19 @@ from __future__ import annotations
 from collections.abc import Callable
 from functools import lru_cache
 from itertools import pairwise
-from typing import NamedTuple
+from pathlib import Path
+from typing import Any, NamedTuple
 
 import numpy as np
 import torch
 import torch.nn.functional as F
+from safetensors.torch import load_file
 from torch import Tensor, nn
 
 from spadwarp.denoise.histogram_network import HistogramNet, filled_up
 from spadwarp.denoise.layers import GROUP, SymmetricConv, SymmetricWindow, edge_padded, enlarged, turned
+from spadwarp.denoise.network_files import Precision, weights_header, weights_path
+from spadwarp.values import FileError
 
 
 class USDN(nn.Module):
@@ -146,14 +150,9 @@ def _apart(rows: int, columns: int, device: torch.device) -> Tensor:
 @lru_cache(maxsize=1)
 def _directions() -> tuple[tuple[int, int], ...]:
     """The neighbour beside a pixel, and the one at its corner, turned by each element of `GROUP`."""
-    places = []
-    for start in ((1, 2), (2, 2)):
-        for element in range(GROUP):
-            probe = np.zeros((3, 3), np.int64)
-            probe[start] = 1
-            row, column = np.argwhere(turned(probe, element))[0]
-            places.append((int(row) - 1, int(column) - 1))
-    return tuple(places)
+    images = [turned(np.arange(9).reshape(3, 3), element) for element in range(GROUP)]
+    places = (np.argwhere(image == pixel)[0] - 1 for pixel in (5, 8) for image in images)
+    return tuple((int(row), int(column)) for row, column in places)
 
 
 class _Residual(nn.Module):
@@ -169,7 +168,7 @@ class _Residual(nn.Module):
 
 _WIDEST = 0.1  # depths this far from the first answer still count for the second
 _NEAR = 5  # side of the window whose depths are taken as they are
-_BOXES = (9, 6), (36, 24)  # sides of the wider windows whose means are taken, and the pixels between them
+_BOXES = (9, 6, 1), (36, 24, 4)  # sides of wider windows whose means are taken, pixels between them, and their grid
 
 
 class PyramidNet(nn.Module):
@@ -213,9 +212,7 @@ class PyramidNet(nn.Module):
             assert self.scalars.bias is not None
             self.near.bias[0] = 3.0  # of the pixel itself
             for window in self.wide:
-                for bias in window.parameters(recurse=False):
-                    if bias.ndim == 1:
-                        bias.fill_(-2.0)
+                nn.init.constant_(window.bias, -2.0)  # type: ignore[arg-type]
             self.scalars.weight.mul_(0.3)
             self.scalars.bias.copy_(torch.tensor([-2.0, 0.0, 2.0, 0.0, 2.0, -1.0, 3.0]))
             # Begins with the depth voted for, and with features that count little: noise in the weights would at first
@@ -332,8 +329,7 @@ def _candidates(depth: Tensor, reported: Tensor, true: Tensor) -> tuple[list[Ten
     values = _windows(depth, _NEAR, 1)
     trusts = _windows(F.logsigmoid(true) + 1e4 * (reported - 1.0), _NEAR, 1)
     both = torch.cat([certainty * depth, certainty], dim=1)
-    for box, step in _BOXES:
-        coarse = 1 if box < 16 else 4
+    for box, step, coarse in _BOXES:
         mean = F.avg_pool2d(both, coarse) if coarse > 1 else both
         side = box // coarse
         mean = F.avg_pool2d(mean, (side, 1), 1, (side // 2, 0))
@@ -386,6 +382,27 @@ NETWORKS: dict[str, Callable[[], nn.Module]] = {
 """Networks by the name that recipes and commands use."""
 
 
-def build_network(name: str) -> nn.Module:
-    """A network of `NETWORKS` with new weights."""
-    return NETWORKS[name]()
+@lru_cache(maxsize=8)
+def load_network(
+    model: str, weights: str | Path | None = None, device: str = "cpu", precision: Precision = "float32"
+) -> Any:
+    """A network with its weights, ready to run; `precision`: of the layers of PyramidNet."""
+    path = weights_path(model, weights)
+    named = weights_header(path).get("model", model)
+    if named != model:
+        raise FileError(f"{path}: weights of {named!r}, not of {model!r}")
+    try:
+        network: Any = NETWORKS[model]()
+        values = {name: value.float() for name, value in load_file(path).items()}  # counters are cast back
+        network.load_state_dict(values)
+        if wrong := [name for name, value in values.items() if not torch.isfinite(value).all()]:
+            raise ValueError(f"{wrong[0]} is not finite")
+    except Exception as error:  # safetensors and torch have errors of their own
+        raise FileError(f"{path}: not weights of {model!r}: {error}") from error
+    # glibc returns memory to the system after each layer, and fresh pages take as long as the layer, unless a block
+    # this large (at most 32 MiB) was freed before: M_TRIM_THRESHOLD in mallopt(3).
+    torch.empty(31 << 20, dtype=torch.uint8)
+    network = network.to(torch.device(device), getattr(torch, precision))
+    if model != "histograms":
+        network = network.to(memory_format=torch.channels_last)
+    return network.eval().requires_grad_(False)

@@ -19,13 +19,32 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
-from spadwarp.denoise.classical import highest
+from spadwarp.denoise.classical import deviation, highest, interpolated, toeplitz
 from spadwarp.denoise.frames import LOG_DENSITY_LIMIT, MARGIN
-from spadwarp.denoise.histogram_network import toeplitz
 from spadwarp.denoise.recipe import Noise
 
 _THINGS = 10  # at most, in a scene
 _JITTER = 0.004  # deviation of a reported depth [m]; a recipe's sigma_scale multiplies it
+
+
+BINS = 64
+"""Bins of a backscatter profile over the gate."""
+
+SUBPIXELS = 3
+"""Rows and columns of subpixels in each pixel of the scenes behind histograms: a pixel sees an area, not a point."""
+
+
+class CleanScenes(NamedTuple):
+    """Clean scenes on the training device, float32; H and W of pixels, or of subpixels."""
+
+    depth: Tensor  # [S, H, W] [m]; NaN where nothing is hit
+    sigma: Tensor  # Cramér–Rao bound of depth, [S, H, W] [m]; NaN where there is none
+    gate: Tensor  # start and stop in depth, [S, 2] [m]
+    profile: Tensor  # density of backscatter over the gate, mean 1, [S, BINS]
+
+    def to(self, device: torch.device | str) -> CleanScenes:
+        """The same on another device."""
+        return CleanScenes(*(values.to(device) for values in self))
 
 
 @dataclass(frozen=True, eq=False)
@@ -47,25 +66,26 @@ class Random:
     def coin(self, probability: float, *shape: int) -> Tensor:
         return self.uniform(*shape) < probability
 
-    def normal(self, shape: torch.Size) -> Tensor:
-        return torch.randn(shape, generator=self.generator, device=self.generator.device)
+    def normal(self, *shape: int) -> Tensor:
+        return torch.randn((self.size, *shape), generator=self.generator, device=self.generator.device)
 
     def integer(self, stop: int, *shape: int) -> Tensor:
         return torch.randint(stop, (self.size, *shape), generator=self.generator, device=self.generator.device)
 
 
-def draw_scenes(count: int, side: int, generator: torch.Generator, *, finer: int = 1) -> tuple[Tensor, Tensor, Tensor]:
-    """Depth and its deviation `[S, side, side]`, NaN where there is only water, and gates around it `[S, 2]` [m].
+def procedural_scenes(count: int, side: int, *, seed: int, device: torch.device | str, finer: int = 1) -> CleanScenes:
+    """Scenes in water of flat backscatter, with gates around them.
 
     With `finer` they are of so many rows and columns of subpixels in each pixel, in part from farther away, and steep
     surfaces are darker.
     """
+    generator = torch.Generator(device).manual_seed(seed)
     random = Random(count, generator)
     relief = random.log_between((0.08, 2.5), 1, 1)  # of the whole scene [m]
     depth = _background(side, random, finer)
     together = random.coin(0.35)  # things that are parts of one body
     centre, place = 0.3 * side * (2 * random.uniform(2) - 1), random.between((0.15, 0.85))
-    paint = 0.5 * random.normal(torch.Size((count, 1, 1))) * torch.ones_like(depth)  # ln of reflectance, negative
+    paint = 0.5 * random.normal(1, 1) * torch.ones_like(depth)  # ln of reflectance, negative
     number = torch.where(random.coin(0.15), 0, 1 + random.integer(_THINGS))
     far = torch.ones_like(place)  # as much smaller are all things
     if finer > 1:
@@ -84,28 +104,25 @@ def draw_scenes(count: int, side: int, generator: torch.Generator, *, finer: int
                 surface = z[chosen, None, None] + surface
                 drawn = inside & (surface > -0.1) & ~(surface >= depth[chosen])
                 depth[chosen] = torch.where(drawn, surface, depth[chosen])
-                paint[chosen] = torch.where(drawn, 0.5 * part.normal(torch.Size((len(chosen), 1, 1))), paint[chosen])
+                paint[chosen] = torch.where(drawn, 0.5 * part.normal(1, 1), paint[chosen])
     metres = 15.0 + relief * (depth - 0.5)
-    grain = 0.5 * random.uniform(1, 1) * random.coin(0.3, 1, 1) * random.normal(depth.shape)  # from pixel to pixel
-    texture = 0.5 * smooth_noise(count, side * finer, generator) + 0.3 * _pattern(side, random, finer)
+    grain = 0.5 * random.uniform(1, 1) * random.coin(0.3, 1, 1) * random.normal(*depth.shape[1:])  # from pixel to pixel
+    texture = 0.5 * smooth_noise(random, side * finer) + 0.3 * _pattern(side, random, finer)
     texture = torch.exp(texture + paint + grain)
     if finer > 1:
         texture *= _steepness(metres * finer / random.log_between((0.01, 0.12), 1, 1)).square().add(1.0) ** 0.25
     sigma = torch.where(torch.isfinite(metres), _JITTER * texture.clamp(0.3, 4.0), math.nan)
-    low = torch.where(torch.isfinite(metres), metres, math.inf).flatten(1).amin(dim=1)
-    high = torch.where(torch.isfinite(metres), metres, -math.inf).flatten(1).amax(dim=1)
-    empty = low > high
-    low, high = torch.where(empty, 14.5, low), torch.where(empty, 15.5, high)
+    low, high = _extent(metres, metres.isfinite(), metres.new_tensor([[14.5, 15.5]]))
     margins = random.log_between((0.02, 2.0), 2)
-    return metres, sigma, torch.stack([low - margins[:, 0], high + margins[:, 1]], dim=1)
+    gate = torch.stack([low - margins[:, 0], high + margins[:, 1]], dim=1)
+    return CleanScenes(metres, sigma, gate, torch.ones(count, BINS, device=metres.device))
 
 
-def smooth_noise(count: int, side: int, generator: torch.Generator) -> Tensor:
-    """Fields of noise over several scales, deviation about 1, `[count, side, side]`."""
-    total = torch.zeros((count, 1, side, side), device=generator.device)
-    random = Random(count, generator)
+def smooth_noise(random: Random, side: int) -> Tensor:
+    """Fields of noise over several scales, deviation about 1, `[S, side, side]`."""
+    total = torch.zeros((random.size, 1, side, side), device=random.generator.device)
     for cells in (3, 6, 12, 24):
-        coarse = random.normal(torch.Size((count, 1, cells, cells)))
+        coarse = random.normal(1, cells, cells)
         weight = random.uniform(1, 1, 1) * (3.0 / cells) ** 0.5
         total += weight * F.interpolate(coarse, size=(side, side), mode="bicubic", align_corners=False)
     return total[:, 0]
@@ -127,7 +144,7 @@ def _background(side: int, random: Random, finer: int) -> Tensor:
     count, device = random.size, random.generator.device
     y, x = _turned(torch.zeros(count, 2, device=device), side, random, finer)
     kind = random.uniform()[:, None, None]
-    rough = 0.15 * random.uniform(1, 1) * random.coin(0.6, 1, 1) * smooth_noise(count, side * finer, random.generator)
+    rough = 0.15 * random.uniform(1, 1) * random.coin(0.6, 1, 1) * smooth_noise(random, side * finer)
     slope = 0.6 * (2 * random.uniform(1, 1) - 1) * random.coin(0.7, 1, 1)
     wall = 1.0 + slope * x / side + rough
     nearest, horizon = random.between((0.0, 0.7), 1, 1), random.between((-0.6, 0.5), 1, 1)
@@ -158,6 +175,12 @@ def _pattern(side: int, random: Random, finer: int) -> Tensor:
 
 
 # Shapes: where they are, and their relative depth about their own, at coordinates y, x [pixels] `[S, side, side]`.
+
+
+def _within(y: Tensor, x: Tensor, limits: tuple[float, float], random: Random) -> Tensor:
+    """A rectangle."""
+    extent = random.log_between(limits, 2, 1, 1)
+    return (x.abs() < extent[:, 0]) & (y.abs() < extent[:, 1])
 
 
 def _plate(y: Tensor, x: Tensor, random: Random) -> tuple[Tensor, Tensor]:
@@ -208,8 +231,7 @@ def _net(y: Tensor, x: Tensor, random: Random) -> tuple[Tensor, Tensor]:
     second = torch.where(random.coin(0.5, 1, 1), 1.0, random.between((0.4, 2.5), 1, 1)) * pitch
     bent = y + 3.0 * torch.sin(x / 17.0 + 6 * random.uniform(1, 1)) * random.coin(0.5, 1, 1)
     lines = (_from_lines(x, pitch) < half) | (_from_lines(bent, second) < half)
-    extent = random.log_between((20.0, 120.0), 2, 1, 1)
-    inside = (x.abs() < extent[:, 0]) & (y.abs() < extent[:, 1])
+    inside = _within(y, x, (20.0, 120.0), random)
     return lines & inside, random.between((-0.4, 0.4), 1, 1) * x / 120.0 + 0.03 * torch.sin(y / 23.0)
 
 
@@ -244,7 +266,7 @@ def _chain(y: Tensor, x: Tensor, random: Random) -> tuple[Tensor, Tensor]:
 
 def _rock(y: Tensor, x: Tensor, random: Random) -> tuple[Tensor, Tensor]:
     """A patch of thresholded noise, whose relief is the noise."""
-    noise = smooth_noise(random.size, x.shape[-1], random.generator)
+    noise = smooth_noise(random, x.shape[-1])
     fade = (x.square() + y.square()).sqrt() / random.log_between((15.0, 80.0), 1, 1)
     height = noise + 1.0 - 1.5 * fade
     return height > 0.0, -random.between((0.0, 0.25), 1, 1) * height.clamp(0.0, 2.0)
@@ -256,8 +278,7 @@ def _blocks(y: Tensor, x: Tensor, random: Random) -> tuple[Tensor, Tensor]:
     row, column = (y / pitch[:, 0]).floor(), (x / pitch[:, 1]).floor()
     hashed = torch.sin(12.9898 * row + 78.233 * column + 100.0 * random.uniform(1, 1)) * 43758.5453
     height = hashed - hashed.floor()
-    extent = random.log_between((10.0, 80.0), 2, 1, 1)
-    inside = (x.abs() < extent[:, 0]) & (y.abs() < extent[:, 1]) & (height > random.between((-0.5, 0.5), 1, 1))
+    inside = _within(y, x, (10.0, 80.0), random) & (height > random.between((-0.5, 0.5), 1, 1))
     return inside, -random.between((0.02, 0.5), 1, 1) * height
 
 
@@ -275,15 +296,13 @@ def _sieve(y: Tensor, x: Tensor, random: Random) -> tuple[Tensor, Tensor]:
     hole = random.log_between((0.7, 4.0), 2, 1, 1)
     slit = random.coin(0.5, 1, 1)
     open_ = (_from_lines(x, pitch[:, 0]) < hole[:, 0]) & (slit | (_from_lines(y, pitch[:, 1]) < hole[:, 1]))
-    extent = random.log_between((12.0, 120.0), 2, 1, 1)
-    inside = (x.abs() < extent[:, 0]) & (y.abs() < extent[:, 1])
+    inside = _within(y, x, (12.0, 120.0), random)
     return inside & ~open_, (random.between((-0.4, 0.4), 1, 1) * x + random.between((-0.4, 0.4), 1, 1) * y) / 100.0
 
 
 def _sea(y: Tensor, x: Tensor, random: Random) -> tuple[Tensor, Tensor]:
     """A sheet with round waves, flat to steep."""
-    extent = random.log_between((15.0, 120.0), 2, 1, 1)
-    inside = (x.abs() < extent[:, 0]) & (y.abs() < extent[:, 1])
+    inside = _within(y, x, (15.0, 120.0), random)
     height = random.log_between((0.02, 0.4), 1, 1)
     return inside, height * torch.sin(x / random.log_between((2.0, 15.0), 1, 1)) + 0.2 * height * torch.sin(y / 9.0)
 
@@ -295,9 +314,6 @@ KINDS = (_plate, _ellipsoid, _rod, _rope, _net, _ladder, _plant, _chain, _rock, 
 # Crops, and the noise of a camera.
 
 
-BINS = 64
-"""Bins of a backscatter profile over the gate."""
-
 COUNT_BINS = (64, 96, 128, 192, 256, 400)
 """Bins of the histograms behind frames with few photons, one number for each batch."""
 
@@ -306,23 +322,6 @@ _WRONG = (0.5, 2.0)  # factors on a background, and on the width of a response, 
 _FLOOR = 0.01  # part of the signal that may come in any bin, where a response is fitted
 _ESTIMATED = 0.03, 0.1  # deviations of height and slope, relative, of a background that is estimated from the frame
 _TAPS = 32  # a response extends over this many bins to each side
-
-
-SUBPIXELS = 3
-"""Rows and columns of subpixels in each pixel of the scenes behind histograms: a pixel sees an area, not a point."""
-
-
-class CleanScenes(NamedTuple):
-    """Clean scenes on the training device, float32; H and W of pixels, or of subpixels."""
-
-    depth: Tensor  # [S, H, W] [m]; NaN where nothing is hit
-    sigma: Tensor  # Cramér–Rao bound of depth, [S, H, W] [m]; NaN where there is none
-    gate: Tensor  # start and stop in depth, [S, 2] [m]
-    profile: Tensor  # density of backscatter over the gate, mean 1, [S, BINS]
-
-    def to(self, device: torch.device | str) -> CleanScenes:
-        """The same on another device."""
-        return CleanScenes(*(values.to(device) for values in self))
 
 
 class Batch(NamedTuple):
@@ -344,13 +343,6 @@ class _Crops(NamedTuple):
     camera: Tensor  # start and width of that gate, which is wider, [B, 2]
     seen: Tensor  # depth of the subpixels of each pixel, NaN where there is none, [B, n, h, w]
     bound: Tensor  # its bound
-
-
-def procedural_scenes(count: int, side: int, *, seed: int, device: torch.device | str, finer: int = 1) -> CleanScenes:
-    """Scenes of `draw_scenes`, in water of flat backscatter."""
-    generator = torch.Generator(device).manual_seed(seed)
-    depth, sigma, gate = draw_scenes(count, side, generator, finer=finer)
-    return CleanScenes(depth, sigma, gate, torch.ones(count, BINS, device=depth.device))
 
 
 def draw_batch(
@@ -398,7 +390,7 @@ def _report(crops: _Crops, noise: Noise, random: Random, always_replaced: bool) 
     """Reported depths over the gate, and which pixels report, `[B, h, w]`: the target's, or backscatter's."""
     clean, sigma, hit, reach, profile, camera, _, _ = crops
     start, width = camera[:, 0, None, None], camera[:, 1, None, None]
-    reported = clean + sigma * random.normal(clean.shape)
+    reported = clean + sigma * random.normal(*clean.shape[1:])
     late = (sigma * random.between((0.5, 3.0), 1, 1)) * -torch.log1p(-random.uniform(*clean.shape[1:]))
     reported = reported + torch.where(random.coin(noise.tail, 1, 1), late, 0.0)
     none = random.coin(0.0 if always_replaced else 0.1)
@@ -446,12 +438,11 @@ def _draw_crops(scenes: CleanScenes, noise: Noise, crop: int, random: Random, fi
     """Crops of random scenes, each with a gate and a water."""
     index = random.integer(len(scenes.depth))
     seen, bound = _cut(scenes, index, crop, random, finer)
-    depth, sigma = (image[:, seen.shape[1] // 2] for image in (seen, bound))
     if noise.resampled > 0.0:
         chosen = random.coin(noise.resampled, 1, 1, 1)
         means = (image.nanmean(dim=1, keepdim=True) for image in (seen, bound))
         seen, bound = (torch.where(chosen, *pair) for pair in zip(means, (seen, bound), strict=True))
-        depth, sigma = (image[:, seen.shape[1] // 2] for image in (seen, bound))
+    depth, sigma = (image[:, seen.shape[1] // 2] for image in (seen, bound))
     hit = torch.isfinite(depth) & torch.isfinite(sigma)
     gate = scenes.gate[index]
     own = random.coin(noise.own_gate)
@@ -502,7 +493,7 @@ def _cut(scenes: CleanScenes, index: Tensor, crop: int, random: Random, finer: i
 
 
 def _extent(depth: Tensor, hit: Tensor, gate: Tensor) -> tuple[Tensor, Tensor]:
-    """Nearest and farthest depth of each crop; the scene's gate where it sees nothing."""
+    """Nearest and farthest depth of each image `[B, h, w]`; the gate `[1 or B, 2]` where it sees nothing."""
     low = torch.where(hit, depth, math.inf).flatten(1).amin(dim=1)
     high = torch.where(hit, depth, -math.inf).flatten(1).amax(dim=1)
     seen = hit.flatten(1).any(dim=1)
@@ -514,10 +505,7 @@ def _backscatter_depth(profile: Tensor, reach: Tensor, u: Tensor) -> Tensor:
     size, bins = profile.shape
     cumulative = torch.cat([profile.new_zeros(size, 1), profile.cumsum(dim=1)], dim=1) / bins
     cumulative = cumulative / cumulative[:, -1:].clamp_min(1e-12)
-    place = reach.flatten(1).clamp(0.0, 1.0) * bins
-    below = place.long().clamp(max=bins - 1)
-    limit = torch.lerp(cumulative.gather(1, below), cumulative.gather(1, below + 1), place - below)
-    wanted = u.flatten(1) * limit
+    wanted = u.flatten(1) * interpolated(cumulative, reach.flatten(1) * bins)
     upper = torch.searchsorted(cumulative, wanted.contiguous(), right=True).clamp(1, bins)
     first, last = cumulative.gather(1, upper - 1), cumulative.gather(1, upper)
     inside = (wanted - first) / (last - first).clamp_min(1e-12)
@@ -570,8 +558,7 @@ def _wrong_response(true: Tensor, random: Random) -> tuple[_Response, Tensor]:
 
     Its deviation is wrong by up to a factor of 2. Who knows no better has measured the offset with it, too.
     """
-    place = torch.arange(-_TAPS, _TAPS + 1, device=true.device)
-    width = (true * place.square()).sum(dim=1, keepdim=True).sqrt() * random.log_between(_WRONG, 1)
+    width = deviation(true, 0.0)[:, None] * random.log_between(_WRONG, 1)
     width, none = width.clamp(0.3, _TAPS / 3.0), torch.zeros_like(width)
     found = _Response(width, width, none, none, none + 1.0)
     shift = torch.arange(-60.0, 61.0, device=true.device)[:, None] * 0.1
@@ -637,7 +624,7 @@ def _draw_counts(
     rate += level[:, None, None] * bright[..., None] * from_before
     counts = torch.poisson(rate.add_(1e-4), generator=generator)
     level = level * torch.where(random.coin(noise.wrong, 1), random.log_between(_WRONG, 1), 1.0)
-    height, slope = (random.normal(torch.Size((len(clean), 1))) * random.coin(0.5, 1) for _ in range(2))
+    height, slope = (random.normal(1) * random.coin(0.5, 1) for _ in range(2))
     level = level * torch.exp(_ESTIMATED[0] * height + _ESTIMATED[1] * slope * (place - 0.5))
     return counts, level, given
 
@@ -649,7 +636,7 @@ def _second_surface(clean: Tensor, hit: Tensor, noise: Noise, random: Random) ->
     """
     side = clean.shape[-1]
     apart = random.between((0.03, 0.4), 1, 1) * (1.0 - 2.0 * random.coin(0.5, 1, 1).float())
-    veiled = smooth_noise(len(clean), side, random.generator)[:, : clean.shape[1]] > random.between((-0.5, 1.0), 1, 1)
+    veiled = smooth_noise(random, side)[:, : clean.shape[1]] > random.between((-0.5, 1.0), 1, 1)
     beside = random.coin(0.5, 1, 1)
     second = torch.where(beside, clean.roll(1, 2), (clean + apart).clamp(0.01, 0.99))
     there = hit & torch.where(beside, hit.roll(1, 2) & ((second - clean).abs() > 0.005), veiled)
@@ -700,7 +687,7 @@ def _scattered(rate: Tensor, noise: Noise, generator: torch.Generator) -> Tensor
         across = torch.matmul(spread(width, scale * factor)[:, None], late)
         light += part[:, None, None, None] * torch.bmm(spread(height, scale * factor), across.flatten(2)).view_as(rate)
     rough = random.between(noise.roughness, 1, 1)[..., None]
-    light *= random.normal(rate.shape).mul_(rough).sub_(0.5 * rough.square()).exp_()
+    light *= random.normal(*rate.shape[1:]).mul_(rough).sub_(0.5 * rough.square()).exp_()
     thin = 1.0 - torch.exp(-random.log_between((0.01, 3.0), 1, 1))
     share = torch.where(random.coin(noise.halo, 1, 1), thin, random.uniform(1, 1))
     return torch.lerp(rate, light, share[..., None])

@@ -1,4 +1,4 @@
-"""Training: one loop for every network, on a CPU or a GPU.
+"""Training: the samples, the loss, and one loop for every network, on a CPU or a GPU.
 
 An interrupted run resumes from its last checkpoint when the command is repeated.
 """
@@ -16,21 +16,113 @@ from pathlib import Path
 from statistics import fmean
 from typing import Any
 
+import numpy as np
 import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
-from spadwarp.denoise.classical import highest
-from spadwarp.denoise.histogram_network import CLOSE, answer, log_likelihood, mean_depth
+from spadwarp.denoise.classical import highest, log_likelihood
+from spadwarp.denoise.histogram_network import CLOSE, answer, mean_depth
 from spadwarp.denoise.layers import fixed_order
-from spadwarp.denoise.network_files import load_network, torch_device
-from spadwarp.denoise.networks import build_network
-from spadwarp.denoise.recipe import LEAST_CROP, LEVELS, Noise, TrainingRecipe
-from spadwarp.denoise.samples import Samples, Sizes
-from spadwarp.denoise.synthetic_noise import Batch, CleanScenes, draw_batch, procedural_scenes
+from spadwarp.denoise.network_files import torch_device
+from spadwarp.denoise.networks import NETWORKS, load_network
+from spadwarp.denoise.recipe import LEAST_CROP, LEVELS, Noise, Part, TrainingRecipe
+from spadwarp.denoise.synthetic_noise import COUNT_BINS, SUBPIXELS, Batch, CleanScenes, draw_batch, procedural_scenes
 from spadwarp.io.paths import atomic_path
 from spadwarp.parallel import interruptible
 from spadwarp.values import ConfigError, FileError
+
+# The samples: clean scenes, and which noisy crops of them each step learns from.
+
+_OPEN = (0.03, 0.85)  # part of a scene that is target, where it counts as a target in open water
+
+
+class Samples:
+    """Batches of crops, drawn anew in each step; those of histograms of one part of the mixture, and its bins.
+
+    In `optimiser.wide` of the steps, drawn at random, it is a quarter as many crops of twice the recipe's side: with
+    small crops alone, the network would never see a pixel far from the border of its image. They are cut from scenes
+    `given`, of a dataset, or from new ones, which do not depend on the steps before. `prepare` is called before each
+    step; `batch` may then be recorded in a CUDA graph, for steps of the same `kind`.
+    """
+
+    def __init__(self, recipe: TrainingRecipe, generator: torch.Generator, given: CleanScenes | None) -> None:
+        self.recipe, self.generator, self.histograms = recipe, generator, recipe.model == "histograms"
+        self.given = None if given is None else given.to(generator.device)
+        self.finer = SUBPIXELS if given is None and self.histograms else 1
+        self.parts = recipe.parts()
+        self.crop, self.size, self.part, self.bins = 0, 0, self.parts[0], COUNT_BINS[0]
+        # By the side of the crops: scenes with the turn in which they were drawn, those of the step, and held ones.
+        self.drawn: dict[int, tuple[int, CleanScenes]] = {}
+        self.now: dict[int, CleanScenes] = {}
+        self.held: dict[int, CleanScenes] = {}
+
+    def _scenes(self, step: int) -> CleanScenes:
+        if self.given is not None:
+            return self.given
+        settings, side = self.recipe.optimiser, self.crop + 32
+        turn = step // settings.redraw
+        if self.crop not in self.drawn or self.drawn[self.crop][0] != turn:
+            seed = (self.recipe.seed * 1_000_003 + turn) * 4096 % 2**62
+            device = self.generator.device
+            scenes = procedural_scenes(settings.scenes, side, seed=seed, device=device, finer=self.finer)
+            self.drawn[self.crop] = turn, scenes
+        return self.drawn[self.crop][1]
+
+    def prepare(self, step: int) -> None:
+        settings = self.recipe.optimiser
+        scale = 2 if np.random.default_rng((self.recipe.seed, step)).random() < settings.wide else 1
+        self.crop, self.size = scale * settings.crop, max(1, settings.batch // scale**2)
+        now = self._scenes(step)
+        if self.histograms:
+            host = np.random.default_rng((self.recipe.seed, 0, step))
+            self.part = self.parts[host.choice(len(self.parts), p=[part.share for part in self.parts])]
+            often = 1.0 / np.array(COUNT_BINS)  # many bins take as much more time
+            self.bins = int(host.choice(COUNT_BINS, p=often / often.sum()))
+            if host.random() < self.part.open_water:
+                now = in_open_water(now)
+            if host.random() < self.part.crowded:
+                now = crowded(now)
+        if self.crop in self.held and now is not self.now[self.crop]:
+            for kept, new in zip(self.held[self.crop], now, strict=True):
+                kept.copy_(new)
+        self.now[self.crop] = now
+
+    @property
+    def kind(self) -> tuple[int, Part, int]:
+        """What the operations of a step depend on."""
+        return self.crop, self.part, self.bins
+
+    def hold(self) -> None:
+        """From now on `batch` reads the same memory in every step with crops of this side."""
+        if self.crop not in self.held:
+            self.held[self.crop] = CleanScenes(*(values.clone() for values in self.now[self.crop]))
+
+    def batch(self) -> Batch:
+        return draw_batch(
+            self.held.get(self.crop, self.now[self.crop]), self.part, size=self.size, crop=self.crop,
+            generator=self.generator, histograms=self.histograms, bins=self.bins, finer=self.finer,
+        )  # fmt: skip
+
+
+def in_open_water(scenes: CleanScenes) -> CleanScenes:
+    """As many, of those that have a target in open water; all if none has."""
+    share = scenes.depth.isfinite().flatten(1).float().mean(1)
+    some = ((share > _OPEN[0]) & (share < _OPEN[1])).nonzero()[:, 0]
+    if not len(some):
+        return scenes
+    chosen = some[torch.arange(len(share), device=some.device) % len(some)]
+    return CleanScenes(*(values[chosen] for values in scenes))
+
+
+def crowded(scenes: CleanScenes) -> CleanScenes:
+    """Each scene with the next one: of both, each pixel sees the nearer surface."""
+    other = CleanScenes(*(values.roll(1, 0) for values in scenes))
+    before: Tensor = (scenes.depth <= other.depth) | other.depth.isnan()
+    depth, sigma = (torch.where(before, *pair) for pair in zip(scenes[:2], other[:2], strict=True))
+    gate = torch.stack([torch.minimum(scenes.gate, other.gate)[:, 0], torch.maximum(scenes.gate, other.gate)[:, 1]], 1)
+    return CleanScenes(depth, sigma, gate, scenes.profile)
+
 
 # The loss: the error of depth, and of the network's other answers.
 
@@ -58,9 +150,9 @@ def loss_of(output: Tensor, batch: Batch) -> Tensor:
     if logits.shape[1]:
         right = batch.hit * ((depth.detach() - batch.clean).abs() < CLOSE)
         true = batch.hit * ((batch.inputs[0][:, :1] - batch.clean).abs() < _NEAR)
-        error = error + _TARGET * _target_error(logits[:, :1], batch)
-        for part, truth in ((logits[:, 1:2], right), (logits[:, 2:], true)):
-            error = error + _OTHERS * F.binary_cross_entropy_with_logits(part, truth)
+        shares, truths = (_TARGET, _OTHERS, _OTHERS), (batch.hit, right, true)
+        for share, logit, truth in zip(shares, logits.split(1, dim=1), truths, strict=True):
+            error = error + share * F.binary_cross_entropy_with_logits(logit, truth)
     return error
 
 
@@ -80,18 +172,13 @@ def histogram_loss(log_probability: Tensor, target: Tensor, batch: Batch) -> Ten
     entropy = -torch.log(right + _OUTLIER)
     entropy = (hit * entropy).flatten(1).sum(dim=1) / pixels
     error = _mean_with_target(0.5 * torch.log(square + _FINE_FLOOR) + _BINS * entropy, hit)
-    return error + _SEEN * _target_error(target[:, None], batch)
+    return error + _SEEN * F.binary_cross_entropy_with_logits(target, hit)
 
 
 def _mean_with_target(error: Tensor, hit: Tensor) -> Tensor:
     """Mean over the crops that have a target."""
     with_target = (hit.flatten(1).mean(dim=1) > 0.005).float()
     return (with_target * error).sum() / with_target.sum().clamp_min(1.0)
-
-
-def _target_error(logit: Tensor, batch: Batch) -> Tensor:
-    """Cross-entropy of "sees a target"."""
-    return F.binary_cross_entropy_with_logits(logit, batch.hit)
 
 
 # Steps
@@ -159,7 +246,7 @@ class Run:
         self.recipe, self.folder, self.device, is_cuda = recipe, folder, device, device.type == "cuda"
         self.log, self.checkpoint = folder / "log.jsonl", folder / "checkpoint.pt"
         torch.manual_seed(recipe.seed)
-        network: Any = build_network(recipe.model)
+        network: Any = NETWORKS[recipe.model]()
         if recipe.start is not None:
             network.load_state_dict(load_network(recipe.start).state_dict(), strict=False)
         self.counting = recipe.model == "histograms"
@@ -173,7 +260,7 @@ class Run:
             weight_decay=decay, betas=(0.9, 0.99), fused=is_cuda, capturable=is_cuda,
         )  # fmt: skip
         self.generator = torch.Generator(device).manual_seed(recipe.seed * 1009)
-        self.samples = Sizes(recipe, self.generator, given)
+        self.samples = Samples(recipe, self.generator, given)
         self.state = {"network": self.network, "average": self.average, "optimiser": self.optimiser}
         self.loss_sum = torch.zeros((), device=device)  # of the steps since the last report
         self.step, spent = self._resume()
@@ -239,44 +326,45 @@ class Run:
         rate = _learning_rate(self.step, self.recipe)
         (group,) = self.optimiser.param_groups
         group["lr"] = group["lr"].fill_(rate) if isinstance(group["lr"], Tensor) else rate
-        samples = self.samples.of(self.step)
-        if recorded := self.graphs.get(samples.kind):
+        kind = self.samples.kind
+        if recorded := self.graphs.get(kind):
             graph, loss = recorded
             graph.replay()
         elif (side := self.side) is not None:
             side.wait_stream(torch.cuda.current_stream())
             with torch.cuda.stream(side):
-                loss = self._work(samples)
+                loss = self._work()
             torch.cuda.current_stream().wait_stream(side)
         else:
-            loss = self._work(samples)
+            loss = self._work()
         settings = self.recipe.optimiser
         _update_mean(self.average, self.network, settings.averaging if self.step > settings.warm_up else 0.0)
         self.loss_sum += loss
         self.step += 1
-        if self.side is not None and samples.kind not in self.graphs:
-            self._capture(samples)
+        if self.side is not None and kind not in self.graphs:
+            self._capture()
 
-    def _capture(self, samples: Samples) -> None:
+    def _capture(self) -> None:
         """Records a step as a CUDA graph; where that fails, training goes on step by step."""
-        samples.hold()
+        self.samples.hold()
+        kind = self.samples.kind
         graph = torch.cuda.CUDAGraph()
         torch.cuda.synchronize()
-        self.graphs[samples.kind] = None
+        self.graphs[kind] = None
         try:
             graph.register_generator_state(self.generator)
             self.optimiser.zero_grad(set_to_none=True)
             with torch.cuda.graph(graph, pool=self.pool):
-                loss = self._work(samples)
+                loss = self._work()
             self.pool = graph.pool()
-            self.graphs[samples.kind] = graph, loss
+            self.graphs[kind] = graph, loss
         except (RuntimeError, AttributeError) as error:
             warnings.warn(f"no CUDA graph of a training step: {error}", stacklevel=2)
             torch.cuda.synchronize()
 
-    def _work(self, samples: Samples) -> Tensor:
+    def _work(self) -> Tensor:
         self.network.train()
-        batch = samples.batch()
+        batch = self.samples.batch()
         is_cuda = self.side is not None
         with torch.autocast(self.device.type, dtype=torch.bfloat16, enabled=is_cuda, cache_enabled=False):
             output = self.network(*batch.inputs)
@@ -362,7 +450,7 @@ def fit(
     with interruptible() as interrupted:
         while run.step < settings.steps and not interrupted.is_set():
             began = time.monotonic()
-            run.samples.of(run.step).prepare(run.step)
+            run.samples.prepare(run.step)
             run.update()
             spent += time.monotonic() - began
             if run.step % settings.interval == 0 or run.step == settings.steps:

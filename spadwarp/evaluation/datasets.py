@@ -14,9 +14,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from spadwarp.dataset import FrameItem, FrameReader, read_manifest
-from spadwarp.denoise.baselines import CLASSICAL, MEDIAN_WINDOWS
+from spadwarp.denoise.baselines import FROM_COUNTS, MEDIAN_WINDOWS, METHODS
 from spadwarp.denoise.frames import DepthFrames, depth_frames
-from spadwarp.denoise.inference import METHODS, denoise_frames
+from spadwarp.denoise.inference import estimate_frames, target_threshold
 from spadwarp.denoise.network_files import compared
 from spadwarp.values import ArgumentError, FileError, check_choice, check_integer
 
@@ -257,7 +257,7 @@ def evaluate(
     for name in models:
         check_choice("models", name, METHODS)
     wanted = [name for name in dict.fromkeys(models) if name != "bm3d"] + ["bm3d"] * (bm3d_frames > 0)
-    if counting := [name for name in wanted if name in ("histograms", *CLASSICAL)]:
+    if counting := [name for name in wanted if name in FROM_COUNTS]:
         raise ArgumentError(
             f"models: {counting[0]!r} needs histograms with their background, which datasets do not keep; "
             "evaluate a result"
@@ -317,8 +317,8 @@ class _Comparison:
             for index in indices:
                 _, frames, clean, seen = self._frame(index)
                 for window in MEDIAN_WINDOWS if seen is not None else ():
-                    found, _ = denoise_frames(frames, model="median", window=window)
-                    square = float(np.mean((found[0] - clean)[seen] ** 2))
+                    found = estimate_frames(frames, model="median", window=window).depth[0]
+                    square = float(np.mean((found - clean)[seen] ** 2))
                     quality.setdefault((level, window), []).append(-math.log10(max(square, 1e-12)))
         levels = dict.fromkeys(level for level, _ in quality)
         return {level: max(MEDIAN_WINDOWS, key=lambda window: np.mean(quality[level, window])) for level in levels}
@@ -334,12 +334,13 @@ class _Comparison:
             if method == "bm3d" and count > bm3d_frames:
                 continue
             window = self.windows.get(level, 5)
-            found, seen_by = denoise_frames(noisy, window=window, device=self.device, **self.methods[method])
-            images[method] = np.where(seen_by[0], found[0], np.float32(np.nan))
-            self.scores.setdefault((method, target, level), []).append(score(clean, found[0], gate=noisy.gate))
+            named = self.methods[method]
+            found = estimate_frames(noisy, window=window, device=self.device, **named)
+            images[method] = found.masked(target_threshold(named["model"]))[0]
+            self.scores.setdefault((method, target, level), []).append(score(clean, found.depth[0], gate=noisy.gate))
             if target == _STAIRCASE:
                 steps = self.steps.get((method, level), Steps())
-                self.steps[method, level] = steps + staircase_steps(clean, found[0])
+                self.steps[method, level] = steps + staircase_steps(clean, found.depth[0])
         if count == 1:
             caption = (
                 f"{target}, {level if 'photons' in level else f'backscatter fraction {level}'}; "

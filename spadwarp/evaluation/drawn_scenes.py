@@ -19,9 +19,9 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from spadwarp.denoise.baselines import CLASSICAL, MEDIAN_WINDOWS
+from spadwarp.denoise.baselines import FROM_COUNTS, MEDIAN_WINDOWS, METHODS
 from spadwarp.denoise.frames import DepthFrames, depth_frames
-from spadwarp.denoise.inference import METHODS, Estimate, denoise_frames, estimate_frames, target_threshold
+from spadwarp.denoise.inference import Estimate, estimate_frames, target_threshold
 from spadwarp.denoise.network_files import compared
 from spadwarp.denoise.recipe import LEVELS
 from spadwarp.evaluation.datasets import Steps, near_jumps, staircase_steps
@@ -302,8 +302,8 @@ def evaluate_scenes(
         seed: Of the noise.
         weights, device, progress: See `evaluate`, as for errors.
     """
-    if unknown := [name for name in models if name not in METHODS or name in ("histograms", *CLASSICAL)]:
-        known = [name for name in METHODS if name not in ("histograms", *CLASSICAL)]
+    if unknown := [name for name in models if name not in METHODS or name in FROM_COUNTS]:
+        known = [name for name in METHODS if name not in FROM_COUNTS]
         raise ArgumentError(f"models: {unknown[0]!r} is not one of {', '.join(known)}, the methods for depth frames")
     if scenes is None:
         scenes = [evaluation_scene(shape, setting) for setting in SETTINGS for shape in SHAPES]
@@ -321,8 +321,8 @@ def evaluate_scenes(
         for scene, noisy in zip(alike, frames, strict=True):
             for method, named in methods.items():
                 found = estimate_frames(noisy, window=window, device=device, **named)
-                seen = found.target_probability[0] >= target_threshold(named["model"])
-                rows[method, setting, water, level, scene.shape] = score_frame(scene, noisy, found.depth[0], seen)
+                least = target_threshold(named["model"])
+                rows[method, setting, water, level, scene.shape] = score_frame(scene, noisy, found, least)
                 _count_reliability(reliability, method, scene, found)
             done += 1
             if progress is not None:
@@ -330,10 +330,9 @@ def evaluate_scenes(
     return SceneScores(methods=tuple(methods), rows=rows, windows=best, reliability=reliability)
 
 
-def score_frame(
-    scene: EvaluationScene, noisy: DepthFrames, found: NDArray[np.float32], seen: NDArray[np.bool_]
-) -> FrameScores:
-    """Scores of the depth `found` `[H, W]` [m], NaN where there is no answer; `seen`: where a target is said to be."""
+def score_frame(scene: EvaluationScene, noisy: DepthFrames, estimated: Estimate, threshold: float = 0.5) -> FrameScores:
+    """Scores of the first frame; `threshold`: probability from which on a pixel is said to see a target."""
+    found, seen = estimated.depth[0], estimated.target_probability[0] >= threshold
     start, stop = scene.gate
     target = np.isfinite(scene.clean)
     rim = near_jumps(scene.clean, target, _JUMP * (stop - start))
@@ -384,8 +383,7 @@ def _best_window(scenes: Sequence[EvaluationScene], frames: Sequence[DepthFrames
     def quality(window: int) -> float:
         values = []
         for scene, noisy in zip(scenes, frames, strict=True):
-            found, seen = denoise_frames(noisy, model="median", window=window)
-            values.append(score_frame(scene, noisy, found[0], seen[0]).psnr)
+            values.append(score_frame(scene, noisy, estimate_frames(noisy, model="median", window=window)).psnr)
         return float(np.nanmean(values))
 
     return max(MEDIAN_WINDOWS, key=quality)

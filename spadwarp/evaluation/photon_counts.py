@@ -16,9 +16,10 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from spadwarp.denoise.baselines import CLASSICAL, MEDIAN_WINDOWS, TUNINGS, classical_depth
+from spadwarp.denoise.baselines import FROM_COUNTS, MEDIAN_WINDOWS, METHODS
 from spadwarp.denoise.frames import DepthFrames, depth_frames
-from spadwarp.denoise.inference import METHODS, denoise_frames, estimate, estimate_histograms, target_threshold
+from spadwarp.denoise.histograms import CountFrames, count_frames
+from spadwarp.denoise.inference import estimate, estimate_frames, estimate_histograms, target_threshold
 from spadwarp.denoise.network_files import compared
 from spadwarp.frames.cramer_rao import crlb_from_histogram
 from spadwarp.frames.depth import arrival_time
@@ -131,8 +132,11 @@ def evaluate_fresh(
 
 def fresh_score(scene: FreshScene, *, weights: str | Path | None = None, device: str | None = None) -> FreshScore:
     """The scores of one scene."""
+    from spadwarp.denoise.classical import TUNINGS, classical_depth
+
     seen, (start, stop) = np.isfinite(scene.clean), scene.gate
-    given: dict[str, Any] = {"background": scene.background, "response": scene.response, "device": device}
+    frames = count_frames(scene.counts, scene.background, scene.response)
+    given: dict[str, Any] = {"response": scene.response, "device": device, "min_significance": 0.0, "weights": weights}
     rmse: dict[str, float] = {}
 
     def metres(part: NDArray[Any]) -> NDArray[np.float32]:
@@ -143,19 +147,16 @@ def fresh_score(scene: FreshScene, *, weights: str | Path | None = None, device:
 
     for method, tunings in TUNINGS.items():
         for tuning in tunings:
-            depth = metres(classical_depth(scene.counts, method=method, tuning=tuning, **given)[0])  # type: ignore[arg-type]
+            depth = metres(classical_depth(frames, method=method, tuning=tuning, device=device)[0])
             judge(f"{method} {tuning:g}", depth)
             if method == "likelihood":
                 first = depth
     for window in MEDIAN_WINDOWS:
-        judge(
-            f"median {window}",
-            denoise_frames(depth_frames(first, gate=scene.gate), model="median", window=window)[0][0],
-        )
+        filtered = estimate_frames(depth_frames(first, gate=scene.gate), model="median", window=window)
+        judge(f"median {window}", filtered.depth[0])
     shares = []
     for name, background in (("histograms", scene.background), ("histograms, own background", "decay")):
-        options = {**given, "background": background, "min_significance": 0.0, "weights": weights}
-        answer = estimate(first, gate=scene.gate, counts=scene.counts, **options)
+        answer = estimate(first, gate=scene.gate, counts=scene.counts, background=background, **given)
         assert answer.significance is not None
         target = (answer.target_probability >= target_threshold("histograms")) & (answer.significance >= 4.0)
         judge(name, answer.depth)
@@ -246,11 +247,11 @@ def photon_sweep(
             bound[row, column] += float(np.mean(np.minimum(sigma[seen], guess) ** 2)) / frames
             for name, sums in squares.items():  # a median of each window is tried; the others have one variant
                 for total, window in zip(sums, MEDIAN_WINDOWS, strict=False):
-                    if methods[name]["model"] in ("histograms", *CLASSICAL):
-                        found = estimate_histograms(noisy.depth, **histograms, device=device, **methods[name]).depth
+                    if methods[name]["model"] in FROM_COUNTS:
+                        found = estimate_histograms(noisy.depth, **histograms, device=device, **methods[name])
                     else:
-                        found, _ = denoise_frames(noisy, window=window, device=device, **methods[name])
-                    total[row, column] += float(np.mean((found[0][seen] - truth[seen]) ** 2)) / frames
+                        found = estimate_frames(noisy, window=window, device=device, **methods[name])
+                    total[row, column] += float(np.mean((found.depth[0][seen] - truth[seen]) ** 2)) / frames
             done += 1
             if progress is not None:
                 progress("frames", done, frames * bound.size)
@@ -309,8 +310,8 @@ def photon_frame(
         return depth_from_time(gate.start + part.astype(np.float64) * (gate.stop - gate.start), scene=scene)
 
     histograms = {
-        "counts": counts[None], "background": background[0, 0].astype(np.float32), "response": matrix,
-        "bins": slice(None), "gate": depth_gate, "to_depth": to_depth,
+        "frames": CountFrames(counts[None], background[0, 0].astype(np.float32), matrix.astype(np.float32)),
+        "bins": slice(None), "bin_width": (depth_gate[1] - depth_gate[0]) / gate.bins, "to_depth": to_depth,
     }  # fmt: skip
     return depth_frames(depth, gate=depth_gate, profile=profile), range_from_time(sigma, index), histograms
 

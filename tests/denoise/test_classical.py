@@ -7,9 +7,9 @@ import pytest
 import torch
 from scipy.stats import norm
 
-from spadwarp import ArgumentError
-from spadwarp.denoise.baselines import CLASSICAL, classical_depth
-from spadwarp.denoise.classical import aggregate, beliefs, total_variation
+from spadwarp.denoise.baselines import CLASSICAL
+from spadwarp.denoise.classical import aggregate, beliefs, classical_depth, total_variation
+from spadwarp.denoise.histograms import count_frames
 from spadwarp.denoise.networks import neighbour_votes
 
 PIXELS, BINS = 5, 5
@@ -60,21 +60,10 @@ def test_neighbours_help_where_photons_are_few_and_edges_stay(method):
     bins, place = 64, np.where(np.arange(24) < 12, 20.5, 40.5) + np.zeros((24, 1))
     rate = 2.0 * np.diff(norm(scale=1.2).cdf(np.arange(bins + 1) - place[..., None]), axis=-1) + 2.0 / bins
     counts = np.random.default_rng(2).poisson(rate)
-    given = {"background": np.full(bins, 2.0 / bins), "response": TAPS}
-    depth = bins * classical_depth(counts, method=method, **given)[0]
+    frames = count_frames(counts, np.full(bins, 2.0 / bins), TAPS)
+    depth = bins * classical_depth(frames, method=method)[0]
     right = (np.abs(depth - place) < 3.0).mean()
     assert 0.6 < right < 0.9 if method == "likelihood" else right > 0.95
-
-
-def test_a_tuning_that_cannot_be_is_refused():
-    given = {"background": np.ones(8), "response": TAPS}
-    for method, tuning, text in (
-        ("total-variation", 0.0, r"tuning = 0.0 is outside \(0, inf\)"),
-        ("belief-propagation", np.nan, r"tuning = nan is outside \(0, inf\)"),
-        ("pooled", 4, r"tuning = 4 is not an odd number of pixels, such as \(3, 5, 7, 11, 15\)"),
-    ):
-        with pytest.raises(ArgumentError, match=text):
-            classical_depth(np.ones((8, 8, 8)), method=method, tuning=tuning, **given)
 
 
 # Votes of neighbouring pixels, against their definition pixel by pixel

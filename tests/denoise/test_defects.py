@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from spadwarp.denoise import estimate
-from spadwarp.denoise.defects import FALSE_ALARMS, find_defects, repaired
+from spadwarp.denoise.histograms import FALSE_ALARMS, find_defects, repaired
 from spadwarp.frames import estimate_background
 from spadwarp.values import SpadwarpWarning
 

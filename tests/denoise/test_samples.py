@@ -4,10 +4,10 @@ import numpy as np
 import pytest
 import torch
 
-from spadwarp.denoise import samples, synthetic_noise
+from spadwarp.denoise import synthetic_noise, training
 from spadwarp.denoise.recipe import Noise, Optimiser, Part, TrainingRecipe
-from spadwarp.denoise.samples import Sizes, crowded, in_open_water
 from spadwarp.denoise.synthetic_noise import SUBPIXELS, Batch, CleanScenes, draw_batch, procedural_scenes
+from spadwarp.denoise.training import Samples, crowded, in_open_water
 
 SHARES = (0.5, 0.3, 0.2)
 OPTIMISER = {"batch": 4, "crop": 32, "scenes": 16, "redraw": 10**6}
@@ -40,15 +40,15 @@ def drawn(monkeypatch):
         asked.append((scenes, noise, size, crop, bins))
         return Batch((torch.rand(size, 1, generator=generator),), *torch.zeros(2, size))
 
-    monkeypatch.setattr(samples, "draw_batch", draw)
+    monkeypatch.setattr(training, "draw_batch", draw)
     return asked
 
 
 def batches(steps, **changes):
-    ours = Sizes(recipe(**changes), torch.Generator().manual_seed(1), None)
+    ours = Samples(recipe(**changes), torch.Generator().manual_seed(1), None)
     for step in range(steps):
-        ours.of(step).prepare(step)
-        ours.of(step).batch()
+        ours.prepare(step)
+        ours.batch()
 
 
 def test_a_part_of_the_steps_learns_from_fewer_crops_of_twice_the_side(drawn):

@@ -44,7 +44,7 @@ def test_networks_have_the_weights_and_the_cost_that_they_state():
     multiply_adds = {}
     for name in ("pyramid", "dncnn"):
         with torch.no_grad(), FlopCounterMode(display=False) as counter:
-            networks.build_network(name).eval()(torch.zeros(1, 3, 64, 64))
+            networks.NETWORKS[name]().eval()(torch.zeros(1, 3, 64, 64))
         multiply_adds[name] = counter.get_total_flops() // 2
     assert multiply_adds["dncnn"] == 64 * 64 * (9 * 64 * 2 + 15 * 9 * 64 * 64) > 6 * multiply_adds["pyramid"]
 
@@ -60,7 +60,7 @@ def test_order_statistics_are_those_of_a_sort():
 def test_pyramid_turns_with_its_frame():
     """All eight turns and reflections, with weights drawn at random; and the way with derivatives gives the same."""
     torch.manual_seed(3)
-    network = networks.build_network("pyramid").eval()
+    network = networks.NETWORKS["pyramid"]().eval()
     with torch.no_grad():
         for values in network.parameters():
             values.add_(0.02 * torch.randn(values.shape))
@@ -229,7 +229,7 @@ def test_a_training_starts_from_the_weights_of_the_package(tmp_path):
         tmp_path, scenes(count=1, size=32), model="histograms", start="histograms", noise=noise, optimiser=once
     )
     learnt = load_file(done.weights)
-    for name, values in network_files.load_network("histograms").state_dict().items():
+    for name, values in networks.load_network("histograms").state_dict().items():
         assert torch.allclose(learnt[name].float(), values, atol=0.01), name  # two steps
     validation = network_files.weights_metadata("histograms", done.weights)["validation_psnr"]
     assert set(validation) == {"1.000", "3.000", "10.000", "30.000", "100.000"}

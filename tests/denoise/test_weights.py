@@ -9,7 +9,7 @@ import torch
 
 from helpers.stepped_frames import GATE, denoised, noisy_frame, scene, scores
 from spadwarp import ArgumentError, DeviceError, FileError
-from spadwarp.denoise import baselines, estimate, inference, weights_metadata
+from spadwarp.denoise import baselines, estimate, inference, networks, weights_metadata
 from spadwarp.denoise.frames import depth_frames, gates_of_target
 from spadwarp.denoise.inference import corrected_target
 from spadwarp.denoise.network_files import MODELS, WEIGHTS
@@ -31,7 +31,8 @@ def estimated(frames, **options):
 
 def found_by_pyramid(frames):
     """Depth, and which pixels see a target."""
-    return inference.denoise_frames(frames, model="pyramid", device="cpu")
+    found = estimated(frames)
+    return found.depth, found.target_probability >= inference.target_threshold("pyramid")
 
 
 @of_depth
@@ -84,9 +85,9 @@ def test_frames_with_few_reports(model, missing):
     few = np.where(np.random.default_rng(5).random(noisy.shape) < missing, np.nan, noisy)
     errors = []
     for depth in (noisy, few):
-        found, seen = inference.denoise_frames(depth_frames(depth, gate=GATE), model=model, device="cpu")
-        assert model != "pyramid" or seen.mean() > 0.94
-        errors.append(np.median(np.abs(found[0] - clean)))
+        found = inference.estimate_frames(depth_frames(depth, gate=GATE), model=model, device="cpu")
+        assert model != "pyramid" or (found.target_probability >= inference.target_threshold(model)).mean() > 0.94
+        errors.append(np.median(np.abs(found.depth[0] - clean)))
     assert errors[1] < 1.5 * errors[0] + 0.001
 
 
@@ -165,13 +166,13 @@ def test_layers_in_bfloat16_answer_as_those_in_float32():
 
 def test_values_beyond_the_range_of_float16_are_computed_in_float32_or_refused(monkeypatch):
     frames = depth_frames(noisy_frame(scene(64, 64)), gate=GATE)
-    load = inference.load_network
+    load = networks.load_network
 
     def overflowing(model, weights=None, device="cpu", precision="float32"):
         network = load(model, weights, device, "float32")
         return network if precision == "float32" else lambda given: network(given) * torch.inf
 
-    monkeypatch.setattr(inference, "load_network", overflowing)
+    monkeypatch.setattr(networks, "load_network", overflowing)
     monkeypatch.setattr(inference, "fast_precision", lambda device: "float16")
     exact = estimated(frames, precision="float32")
     np.testing.assert_array_equal(estimated(frames).depth, exact.depth)

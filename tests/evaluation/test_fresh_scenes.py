@@ -3,7 +3,8 @@
 import numpy as np
 import pytest
 
-from spadwarp.denoise.baselines import classical_depth
+from spadwarp.denoise.classical import classical_depth
+from spadwarp.denoise.histograms import count_frames
 from spadwarp.evaluation import evaluate_fresh
 from spadwarp.evaluation.fresh_scenes import BACKGROUNDS, RESPONSES, SHAPES, TEXTURES, fresh_scene
 
@@ -46,8 +47,8 @@ def test_every_family_gives_numbers():
 def test_scores_are_those_of_the_estimates():
     found = evaluate_fresh(scenes=1, seed=11, device="cpu")
     scene, score = fresh_scene(11, 0, device="cpu"), found.scenes[0]
-    facts = {"background": scene.background, "response": scene.response}
-    part = classical_depth(scene.counts, **facts, method="pooled", tuning=5)
+    frames = count_frames(scene.counts, scene.background, scene.response)
+    part = classical_depth(frames, method="pooled", tuning=5)
     depth = scene.gate[0] + (scene.gate[1] - scene.gate[0]) * part[0]
     error = (depth - scene.clean)[np.isfinite(scene.clean)]
     assert score.rmse["pooled 5"] == pytest.approx(np.sqrt(np.mean(error**2)), rel=1e-4)

@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from spadwarp.denoise import apply
+from spadwarp.denoise import estimate
 from spadwarp.evaluation import datasets
 
 GATE = (13.5, 16.0)
@@ -27,9 +27,9 @@ def noisy_frame(clean, share=0.3, seed=0):
     return frame.astype(np.float32)
 
 
-def denoised(depth, **options):
+def denoised(depth, mask=0.0, **options):
     """Depth denoised on the CPU, over `GATE` unless options say otherwise."""
-    return apply(depth, **{"gate": GATE, "device": "cpu", **options})
+    return estimate(depth, **{"gate": GATE, "device": "cpu", **options}).masked(mask)
 
 
 def scores(clean, estimate):
