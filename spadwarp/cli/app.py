@@ -171,7 +171,9 @@ def note(text: str) -> None:
 
 
 def complain(text: str, kind: str = "") -> None:
-    """Prints to stderr, each line behind its kind: error, warning or note."""
+    """Prints to stderr, each line behind its kind: error, warning or, but with --quiet, note."""
+    if kind == "note" and running.quiet:
+        return
     typer.echo("\n".join(f"{kind}: {line}" for line in text.splitlines()) if kind else text, err=True)
 
 

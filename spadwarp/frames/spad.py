@@ -134,15 +134,10 @@ class Receiver:
 
         seen = Window.of(detector, laser, window or (axis[0], shape[2]), axis[1], tdc_widths)
         noise: Any = kernels.dark_count_rates(
-            shape[0] * shape[1],
-            median=detector.dark_count_rate,
-            spread=detector.dark_count_spread,
-            hot_fraction=detector.hot_pixel_fraction,
-            hot_rate=detector.hot_pixel_rate,
-            offset=detector.ambient_rate,
-            seed=camera_seed,
-            device=device,
-        )
+            shape[0] * shape[1], median=detector.dark_count_rate, spread=detector.dark_count_spread,
+            hot_fraction=detector.hot_pixel_fraction, hot_rate=detector.hot_pixel_rate, offset=detector.ambient_rate,
+            seed=camera_seed, device=device,
+        )  # fmt: skip
         if ambient is not None:
             values = real_array("ambient", ambient, np.float64, shapes=((), shape[:2]), within="[0, inf)")
             rates = noise.numpy() + np.broadcast_to(values, shape[:2]).reshape(-1)
