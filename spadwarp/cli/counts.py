@@ -120,16 +120,20 @@ def _recorded(recording: Recording, frames: int) -> dict[str, Any]:
     median = float(np.median(bound)) if bound.size else math.inf
     per_pixel = recording.detections / (frames * file.shape[1] * file.shape[2])
     return {
-        "pulses": file.pulses, "frames": frames, "seed": file.seed, "detections_per_frame_and_pixel": per_pixel,
+        "pulses": file.pulses,
+        "frames": frames,
+        "seed": file.seed,
+        "detections_per_frame_and_pixel": per_pixel,
         "detections_per_pulse_and_pixel": per_pixel / file.pulses,
         "bound": {
-            "pixels": int(bound.size), "median_m": median if math.isfinite(median) else None,
+            "pixels": int(bound.size),
+            "median_m": median if math.isfinite(median) else None,
             "noise_fraction": noise if math.isfinite(noise) else None,
         },
         "depth": {name: dataclasses.asdict(error) for name, error in recording.errors.items()},
         "noise_ratio": file.target_noise_ratio if math.isfinite(file.target_noise_ratio or 0.0) else None,
         "notes": list(file.notes),
-    }  # fmt: skip
+    }
 
 
 def _bound_noise(recording: Recording, photons: int) -> list[str]:

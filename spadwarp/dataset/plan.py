@@ -311,12 +311,18 @@ class Plan:
             scene = self._moves.scene(scene, index % recipe.scenes_per_target)
         first = index * self.frames_per_scene
         return SceneDraw(
-            index=index, target=number, source=source, scene=scene, distance=distance,
-            attenuation_lengths=float(lengths), signal_photons=draw("exposure.signal", recipe.exposure.signal_photons),
+            index=index,
+            target=number,
+            source=source,
+            scene=scene,
+            distance=distance,
+            attenuation_lengths=float(lengths),
+            signal_photons=draw("exposure.signal", recipe.exposure.signal_photons),
             fractions=tuple(self.fraction(first + k) for k in range(self.frames_per_scene)),
             photons=recipe.monte_carlo.photons if self.is_traced(index) else None,
-            seed=int(self.generator(split, "photons", index).integers(2**63)), split_seed=self.split_seeds[split],
-        )  # fmt: skip
+            seed=int(self.generator(split, "photons", index).integers(2**63)),
+            split_seed=self.split_seeds[split],
+        )
 
     def _trajectory(self) -> Trajectory:
         """Raises `ConfigError` for one that is too short, or that moves what a recipe draws."""

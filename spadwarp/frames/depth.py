@@ -322,11 +322,15 @@ def depth_of(
     distance = 0.5 * path if lines is None else lines.range_from_path(path)
     return Reduction(
         quantity="range" if lines is None else "depth",
-        values=distance if lines is None else lines.depth_from_range(distance), range=distance,
-        intensity=values.sum(axis=-1).reshape(-1, height, width), lines=lines, method=method,
+        values=distance if lines is None else lines.depth_from_range(distance),
+        range=distance,
+        intensity=values.sum(axis=-1).reshape(-1, height, width),
+        lines=lines,
+        method=method,
         camera=None if histograms.scene is None else histograms.scene.camera,
-        significance=None if significance is None else significance.reshape(-1, height, width), notes=(*notes, *window),
-    )  # fmt: skip
+        significance=None if significance is None else significance.reshape(-1, height, width),
+        notes=(*notes, *window),
+    )
 
 
 def _window(histograms: Histograms, index: float) -> str:

@@ -94,11 +94,15 @@ class _StoredFrames:
                 file.stored(f"depth/{name}", np.float32, shape[:3])
             file.stored("significance", np.float32, shape[:3])
             common: dict[str, Any] = {
-                "path": Path(path), "shape": shape, "pulses": file.integer("pulses", "[1, 9223372036854775807]"),
-                "seed": file.integer("seed"), "gate_start": file.real("gate_start"),
-                "bin_width": file.real("bin_width", "(0, inf)"), "period": period if np.isfinite(period) else None,
+                "path": Path(path),
+                "shape": shape,
+                "pulses": file.integer("pulses", "[1, 9223372036854775807]"),
+                "seed": file.integer("seed"),
+                "gate_start": file.real("gate_start"),
+                "bin_width": file.real("bin_width", "(0, inf)"),
+                "period": period if np.isfinite(period) else None,
                 "methods": tuple(name for name in METHODS if name in names),
-            }  # fmt: skip
+            }
             return cls(**common, **cls._own(file, scene, shape))
 
     @classmethod
@@ -210,10 +214,14 @@ class FramesFile(_StoredFrames):
     def frame(self, number: int) -> Frames:
         """One frame as `Frames`. Raises `ArgumentError` where it is not there."""
         return Frames(
-            counts=self.counts(number)[None], frames=1, first_frame=number, expected=self.expected,
-            background=self.background, detector=self.scene.detector,
+            counts=self.counts(number)[None],
+            frames=1,
+            first_frame=number,
+            expected=self.expected,
+            background=self.background,
+            detector=self.scene.detector,
             **{name: getattr(self, name) for name in _OF_A_FRAME},
-        )  # fmt: skip
+        )
 
     def bound_depth(self) -> Map:
         """Cramér–Rao bound of one frame [m], `[H, W]`; NaN where there is no information."""
@@ -308,11 +316,15 @@ class _Writer:
         """Writes what all frames share, reserves space for these, and names the dimensions."""
         file, arrays = self._file, layout.arrays
         common = {
-            "format_version": FORMAT_VERSION, "pulses": part.pulses, "seed": str(part.seed),
-            "gate_start": part.gate_start, "bin_width": part.bin_width,
-            "period": np.inf if part.period is None else part.period, "group_index": scene.medium.group_index,
+            "format_version": FORMAT_VERSION,
+            "pulses": part.pulses,
+            "seed": str(part.seed),
+            "gate_start": part.gate_start,
+            "bin_width": part.bin_width,
+            "period": np.inf if part.period is None else part.period,
+            "group_index": scene.medium.group_index,
             "source": str(scene.source or ""),
-        }  # fmt: skip
+        }
         words = [f"{name} ({', '.join(axes)}): {meaning} [{unit}]" for name, (axes, _, unit, meaning) in arrays.items()]
         file.attrs.update({**common, **layout.attributes, "read_me": _READ_ME + "; ".join(words)})
         file.create_dataset("config", data=scene.to_toml())
@@ -453,12 +465,18 @@ def _still(result: Result, part: Frames, frames: int, bound: Map) -> _Layout:
     """What the file of a scene that stands still holds beside its frames: see `_Layout`."""
     scene, irf, distance = result.scene, part.irf, result.truth.range.astype(np.float64)
     attributes = {
-        "format": FramesFile.FORMAT, "frames": frames, "laser_position": scene.beam.position,
-        "pixel_tangent": scene.camera.pixel_tangent, **camera_attributes(scene.camera, result.focus_distance),
-        "irf_sigma": irf.sigma, "irf_tail": irf.tail,
+        "format": FramesFile.FORMAT,
+        "frames": frames,
+        "laser_position": scene.beam.position,
+        "pixel_tangent": scene.camera.pixel_tangent,
+        **camera_attributes(scene.camera, result.focus_distance),
+        "irf_sigma": irf.sigma,
+        "irf_tail": irf.tail,
         **({} if part.target_noise_ratio is None else {"target_noise_ratio": part.target_noise_ratio}),
-        "notes": list(part.notes), "photons": result.photons, "channel": result.provenance.get("channel", "I"),
-    }  # fmt: skip
+        "notes": list(part.notes),
+        "photons": result.photons,
+        "channel": result.provenance.get("channel", "I"),
+    }
     bins = "whole_gate" if part.background.shape[-1] == 1 < part.expected.shape[-1] else "time"
     arrays: dict[str, Variable] = {
         "expected": ((*PIXELS, "time"), part.expected, "1", "expected detections per pulse before pile-up"),

@@ -136,10 +136,14 @@ def read_histograms(
     if irf is not None and bin_width is not None:
         _check_response(irf, bin_width, values.shape[-1] * bin_width, path)
     return Histograms(
-        values=np.ascontiguousarray(values), bin_width=bin_width,
+        values=np.ascontiguousarray(values),
+        bin_width=bin_width,
         gate_start=(_fact("gate_start", gate_start, raw.gate_start, path) or 0.0) + raw.first,
-        group_index=raw.group_index, irf=irf, response=irf, notes=tuple(notes),
-    )  # fmt: skip
+        group_index=raw.group_index,
+        irf=irf,
+        response=irf,
+        notes=tuple(notes),
+    )
 
 
 def _fact(name: str, given: float | None, held: float | None, path: Path) -> float | None:
@@ -170,17 +174,26 @@ def _read_own(path: Path, channel: Channel) -> Histograms:
             raise ArgumentError(f"channel = {channel!r}: {path} holds frames, whose channel was chosen when drawn")
         file = FramesFile.load(path)
         return Histograms(
-            values=file.counts(), bin_width=file.bin_width, gate_start=file.gate_start, scene=file.scene, irf=file.irf,
-            response=file.irf, background=file.background * np.float32(file.pulses),
+            values=file.counts(),
+            bin_width=file.bin_width,
+            gate_start=file.gate_start,
+            scene=file.scene,
+            irf=file.irf,
+            response=file.irf,
+            background=file.background * np.float32(file.pulses),
             pulses=file.pulses if file.scene.detector.mode == "first_photon" else 0,
-        )  # fmt: skip
+        )
     result = analyser_channel(load_result(path), channel)
     scene = result.scene
     return Histograms(
-        values=result.expected(), bin_width=scene.gate.bin_width, gate_start=scene.gate.start, scene=scene,
-        response=detector_response(scene.detector, scene.laser), notes=tuple(filter(None, [noise_problem(result)])),
+        values=result.expected(),
+        bin_width=scene.gate.bin_width,
+        gate_start=scene.gate.start,
+        scene=scene,
+        response=detector_response(scene.detector, scene.laser),
+        notes=tuple(filter(None, [noise_problem(result)])),
         background=result.expected("backscatter").astype(np.float32),
-    )  # fmt: skip
+    )
 
 
 def _checked(values: NDArray[Any], path: Path) -> NDArray[Any]:

@@ -193,8 +193,13 @@ class Section(_Model):
     """
 
     model_config = ConfigDict(
-        defer_build=True, frozen=True, extra="forbid", strict=True, allow_inf_nan=False, protected_namespaces=(),
-    )  # fmt: skip
+        defer_build=True,
+        frozen=True,
+        extra="forbid",
+        strict=True,
+        allow_inf_nan=False,
+        protected_namespaces=(),
+    )
     section: ClassVar[str] = ""
     """Whose presets it takes."""
     alternatives: ClassVar[tuple[str, ...]] = ()
