@@ -307,12 +307,14 @@ class Run:
         """Writes a line of the log and a checkpoint."""
         settings, now = self.recipe.optimiser, time.monotonic()
         line = {
-            "step": self.step, "loss": float(self.loss_sum) / (self.step % settings.interval or settings.interval),
+            "step": self.step,
+            "loss": float(self.loss_sum) / (self.step % settings.interval or settings.interval),
             "psnr": {f"{level:.3f}": round(value, 3) for level, value in psnr.items()},
-            "mean_psnr": round(fmean(psnr.values()), 3), "input_psnr": round(input_psnr, 3),
+            "mean_psnr": round(fmean(psnr.values()), 3),
+            "input_psnr": round(input_psnr, 3),
             "pairs_per_second": round((self.step - self.timed_from) * settings.batch / (now - self.last_report)),
             "seconds": round(now - self.began, 1),
-        }  # fmt: skip
+        }
         with self.log.open("a") as file:
             file.write(json.dumps(line) + "\n")
         self.loss_sum.zero_()
