@@ -200,7 +200,7 @@ def _one_kind(annotation: Any, metadata: Iterable[Any] = ()) -> str:
         return ", ".join(f'`"{value}"`' for value in get_args(annotation))
     if get_origin(annotation) is tuple:
         parts = get_args(annotation)
-        what = "texts" if parts[0] is str else "numbers"
+        what = "texts" if parts[0] is str or get_origin(parts[0]) is Literal else "numbers"
         what = "tables" if inspect.isclass(parts[0]) and issubclass(parts[0], BaseModel) else what
         alone = any(isinstance(one, BeforeValidator) and isinstance(one.func(1.0), tuple) for one in metadata)
         return ("number or " * alone) + (f"list of {what}" if parts[-1] is Ellipsis else f"{len(parts)} {what}")
@@ -232,14 +232,14 @@ def _default(info: FieldInfo) -> str:
         return ""
     if isinstance(value, tuple) and len(set(map(repr, value))) == 1 and math.isinf(value[0]):
         value = value[0]
-    if isinstance(value, str):
-        return f'`"{value}"`'
     if isinstance(value, tuple):
         return f"`[{', '.join(map(_short, value))}]`"
     return f"`{_short(value)}`"
 
 
 def _short(value: Any) -> str:
+    if isinstance(value, str):
+        return f'"{value}"'
     if isinstance(value, bool):
         return str(value).lower()
     if isinstance(value, int):

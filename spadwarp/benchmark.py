@@ -217,7 +217,7 @@ def run(
     """
     names = list(CASES) if cases is None else list(cases)
     for name in names:
-        check_choice("cases: an item", name, [*CASES, *GROUPS])
+        check_choice("cases", name, [*CASES, *GROUPS])
     photons = None if photons is None else check_integer("photons", photons, "[1, 1000000000000]")
     repeats = check_integer("repeats", repeats, "[1, 1000]")
     wp_device = pick_device(device)

@@ -199,11 +199,13 @@ class Survey:
         collected = self.reflectance / math.pi * scene.camera.aperture_area / distance**2
         photons = ballistic * passed * through * collected * scene.laser.photons_per_pulse
         return OnAxis(
-            distance=distance, optical_depth=optical_depth,
+            distance=distance,
+            optical_depth=optical_depth,
             irradiance=axis_fluence(scene, distance) * passed * scene.laser.average_power,
-            samples_per_pixel=_photons(scene) / scene.scan_positions * ballistic, photons_per_pixel=photons,
+            samples_per_pixel=_photons(scene) / scene.scan_positions * ballistic,
+            photons_per_pixel=photons,
             signal_per_pulse=photons * scene.detections_per_photon,
-        )  # fmt: skip
+        )
 
 
 def check(scene: SceneLike, mesh: TriangleMesh | None = None, *, device: str | None = "cpu") -> list[CheckMessage]:

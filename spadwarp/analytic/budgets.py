@@ -132,10 +132,14 @@ def axis_rows(
     rows: list[BudgetRow] = []
     for (start, stop), inside in gates:
         maps, _ = pixel_maps(
-            scene, view=np.tile([0.0, 0.0, 1.0], (inside.size, 1)), distance=inside,
-            normal=-np.tile(line.direction, (inside.size, 1)), reflectance=np.full(inside.size, reflectance),
-            device=device, gate=(start, stop),
-        )  # fmt: skip
+            scene,
+            view=np.tile([0.0, 0.0, 1.0], (inside.size, 1)),
+            distance=inside,
+            normal=-np.tile(line.direction, (inside.size, 1)),
+            reflectance=np.full(inside.size, reflectance),
+            device=device,
+            gate=(start, stop),
+        )
         background = maps["backscatter"] + (scene.detector.noise_rate + maps["daylight"]) * (stop - start)
         needed = _pulses_needed(scene, maps, background, stop - start, device)
         depths = (inside - line.lead[0]) * scene.medium.extinction
@@ -144,12 +148,18 @@ def axis_rows(
             depths = np.array([scene.optical_depth(start_point, line.points([x])[0].tolist()) for x in inside])
         for i, (distance, depth) in enumerate(zip(inside, depths, strict=True)):
             row = BudgetRow(
-                medium=name or scene.medium.preset or "scene", extinction=scene.medium.extinction,
-                range=float(distance), optical_depth=float(depth), gate_start=start, gate_stop=stop,
-                gate_moved=(start, stop) != gate, pulses=pulses, background=float(background[i]),
+                medium=name or scene.medium.preset or "scene",
+                extinction=scene.medium.extinction,
+                range=float(distance),
+                optical_depth=float(depth),
+                gate_start=start,
+                gate_stop=stop,
+                gate_moved=(start, stop) != gate,
+                pulses=pulses,
+                background=float(background[i]),
                 pulses_for_1cm=float(needed[i]),
                 **{field: float(maps[field][i]) for field in _FROM_MAPS},
-            )  # fmt: skip
+            )
             rows.append(row)
     return rows
 

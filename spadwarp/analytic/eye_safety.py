@@ -108,9 +108,13 @@ def eye_limit(of: Laser | Scene, *, distance: float = 0.1, exposure: float = 100
             hazard = _first(lambda other: as_if_bare(of, other) >= bare, 1e9)
     energy = limit * _AREA / _share(laser, as_if_bare(of, distance), densest)
     return EyeLimit(
-        distance=distance, exposure=exposure, pulse_energy=energy, average_power=energy * laser.repetition_rate,
-        criterion=criterion, hazard_distance=hazard,
-    )  # fmt: skip
+        distance=distance,
+        exposure=exposure,
+        pulse_energy=energy,
+        average_power=energy * laser.repetition_rate,
+        criterion=criterion,
+        hazard_distance=hazard,
+    )
 
 
 def safe_distance_in_water(

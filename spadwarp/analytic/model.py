@@ -102,13 +102,21 @@ def pixel_maps(
         scene, view=views, distance=distances, normal=np.asarray(normal), reflectance=np.asarray(reflectance)
     )
     statistics = sk.statistics_maps(
-        model.lidar, model.phase, model.on_device(profile, np.float32), model.sights[0], model.on_device(signal),
-        model.on_device(arrival, nan=np.nan), backscatter, count_law=chosen.count_law,
+        model.lidar,
+        model.phase,
+        model.on_device(profile, np.float32),
+        model.sights[0],
+        model.on_device(signal),
+        model.on_device(arrival, nan=np.nan),
+        backscatter,
+        count_law=chosen.count_law,
         acquisitions=scene.pulses_per_depth_frame if chosen.count_law == "per_pulse" else chosen.frames,
-        pulses_per_frame=chosen.exposure * scene.laser.repetition_rate, outliers=outliers,
+        pulses_per_frame=chosen.exposure * scene.laser.repetition_rate,
+        outliers=outliers,
         lines=model.line_rows([line.scattering for line in model.lines]),
-        ambient=None if scene.daylight is None else model.on_device(ambient), optics=model.optics,
-    )  # fmt: skip
+        ambient=None if scene.daylight is None else model.on_device(ambient),
+        optics=model.optics,
+    )
     names = ("alpha", "fisher", "sigma_time", "background_level", "outlier_probability")
     maps = {"signal": signal, "arrival": arrival, "backscatter": backscatter.numpy(), "daylight": ambient}
     maps |= {name: values.numpy() for name, values in zip(names, statistics, strict=True)}

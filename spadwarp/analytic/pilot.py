@@ -209,17 +209,25 @@ def measure(
         excess = _excess(frames, returned + constant, constant, method, bound / pool.slope, first_pulses, device)
     lights = [run.tallies[:2].sum(axis=(0, 3), dtype=np.float64)[seen] for run in (first, second)]
     return Pilot(
-        pixels=int(seen.sum()), unscattered=float(both.component("ballistic")[typical].sum(axis=-1).mean() * scale),
-        target=float(returned.sum()), backscatter=float(_background(both)[typical].sum(axis=-1).mean() * scale),
+        pixels=int(seen.sum()),
+        unscattered=float(both.component("ballistic")[typical].sum(axis=-1).mean() * scale),
+        target=float(returned.sum()),
+        backscatter=float(_background(both)[typical].sum(axis=-1).mean() * scale),
         noise=float(np.median(noise_rate(both.scene, both.truth))) * (scene.gate.stop - scene.gate.start),
-        brightest=_brightest(*(run.detections.sum(axis=-1, dtype=np.float64) for run in (first, second))), bound=bound,
-        shot_noise=shot, information_noise=information_noise,
-        floor={name: abs(bias[name]) if even else median(np.abs(values)) for name, values in error.items()}, bias=bias,
-        unscattered_floor={name: median(np.abs(values)) for name, values in unscattered.items()}, pile_up=piled,
-        peak=float(peak), level=float(level),
+        brightest=_brightest(*(run.detections.sum(axis=-1, dtype=np.float64) for run in (first, second))),
+        bound=bound,
+        shot_noise=shot,
+        information_noise=information_noise,
+        floor={name: abs(bias[name]) if even else median(np.abs(values)) for name, values in error.items()},
+        bias=bias,
+        unscattered_floor={name: median(np.abs(values)) for name, values in unscattered.items()},
+        pile_up=piled,
+        peak=float(peak),
+        level=float(level),
         light_noise=math.sqrt(np.mean(np.square(lights[0] - lights[1]))) / max(float(np.mean(sum(lights))), 1e-300),
-        photons=both.photons, excess=excess,
-    )  # fmt: skip
+        photons=both.photons,
+        excess=excess,
+    )
 
 
 def _time(frames: Frames, histogram: Any, background: Any, method: Method, device: str | None) -> Floats:

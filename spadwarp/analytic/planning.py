@@ -204,12 +204,17 @@ def plan(
     check_choice("channel", channel, CHANNELS)
     planner = _Planner(
         depth_error=read_real("depth_error", depth_error, "[1e-9, 1e9] m"),
-        time=read_real("time", time, "[1e-9, 1e9] s"), margin=read_real("margin", margin, "[0, 1e6] m"), method=method,
+        time=read_real("time", time, "[1e-9, 1e9] s"),
+        margin=read_real("margin", margin, "[0, 1e6] m"),
+        method=method,
         full_power=full_power,
         eye_distance=None if eye_distance is None else read_real("eye_distance", eye_distance, "[0, 1e9] m"),
-        eye_exposure=read_real("eye_exposure", eye_exposure, "[1e-6, 3e4] s"), seed=check_integer("seed", seed, SEED),
-        device=device, channel=channel, progress=progress,
-    )  # fmt: skip
+        eye_exposure=read_real("eye_exposure", eye_exposure, "[1e-6, 3e4] s"),
+        seed=check_integer("seed", seed, SEED),
+        device=device,
+        channel=channel,
+        progress=progress,
+    )
     problem = ""
     if channel != "I" and not (scene.camera.channels if channel in POLARISED else channel in scene.tallied_channels):
         problem = f"channel = {channel!r} needs camera.polarisation = 'analyser' or 'stokes', or medium.inelastic"
@@ -360,20 +365,31 @@ class _Planner:
         fluence = axis_fluence(scene, span[0]) * math.exp(-optical_depth)
         index, advance = scene.medium.group_index, port_advance(scene)
         return Proposal(
-            scene=scene, depth_error=self.depth_error, time=self.time, method=self.method, target_range=span,
+            scene=scene,
+            depth_error=self.depth_error,
+            time=self.time,
+            method=self.method,
+            target_range=span,
             optical_depth=optical_depth,
             gate_range=tuple(range_from_time(end, index) + advance for end in (scene.gate.start, scene.gate.stop)),
-            unambiguous_range=range_from_time(1.0 / rate, index) + advance, largest_rate=largest_rate,
-            pile_up_energy=piled, eye=self._eye(scene), energy_limit=energy_limit,
-            irradiance=fluence * scene.laser.pulse_energy * scene.laser.repetition_rate, pulses=pulses,
+            unambiguous_range=range_from_time(1.0 / rate, index) + advance,
+            largest_rate=largest_rate,
+            pile_up_energy=piled,
+            eye=self._eye(scene),
+            energy_limit=energy_limit,
+            irradiance=fluence * scene.laser.pulse_energy * scene.laser.repetition_rate,
+            pulses=pulses,
             pulses_for=purpose,
             pulses_range=(min(ends[0].pulses, ends[2].pulses), max(ends[0].pulses, ends[2].pulses)),
-            frame_time=frame_time, reached=None if factor > 1.0 else purpose in _ENOUGH and frame_time <= self.time,
-            terms=terms, limit=" or ".join(limits),
+            frame_time=frame_time,
+            reached=None if factor > 1.0 else purpose in _ENOUGH and frame_time <= self.time,
+            terms=terms,
+            limit=" or ".join(limits),
             advice=self._advice(ends[1]._replace(purpose=purpose, time=frame_time), pilot.floor, rate, largest_rate),
-            pilot=pilot, photons_needed=traced * factor,
+            pilot=pilot,
+            photons_needed=traced * factor,
             seconds_needed=sum(run.timing.get("trace", math.nan) for run in runs) * factor,
-        )  # fmt: skip
+        )
 
     def _settle(
         self, scene: Scene, runs: Sequence[Result], typical: Mask, even: bool

@@ -131,10 +131,15 @@ class AnalyticResult(Shown):
         for start in range(0, frames, part):
             number = min(part, frames - start)
             drawn = sk.sample_frames(
-                *inputs, laser=self.scene.beam.position, optics=optics, ports=ports,
-                gate_paths=(gate.start * speed, gate.stop * speed), first_frame=first + start, frames=number,
+                *inputs,
+                laser=self.scene.beam.position,
+                optics=optics,
+                ports=ports,
+                gate_paths=(gate.start * speed, gate.stop * speed),
+                first_frame=first + start,
+                frames=number,
                 seed=self.seed if seed is None else seed,
-            )  # fmt: skip
+            )
             for whole, array in zip((depth, labels), drawn, strict=True):
                 whole[start : start + number] = array.numpy().reshape(number, *shape)
         return depth, labels
@@ -169,12 +174,21 @@ class AnalyticResult(Shown):
             frames = check_integer("frames", frames, "[0, 2147483647]")
         count, shape, scene = len(self.depth) if frames is None else frames, self.truth.depth.shape, self.scene
         attributes = {
-            "format": _FORMAT, "format_version": _FORMAT_VERSION, "read_me": _READ_ME, "version": __version__,
-            "source": str(scene.source or ""), "seed": str(self.seed), "form": scene.analytic.form,
-            "backscatter": scene.analytic.backscatter, "count_law": scene.analytic.count_law,
-            "response_sigma": response_sigma(scene), "gate_start": scene.gate.start, "bin_width": scene.gate.bin_width,
-            "bins": scene.gate.bins, "group_index": scene.medium.group_index,
-        }  # fmt: skip
+            "format": _FORMAT,
+            "format_version": _FORMAT_VERSION,
+            "read_me": _READ_ME,
+            "version": __version__,
+            "source": str(scene.source or ""),
+            "seed": str(self.seed),
+            "form": scene.analytic.form,
+            "backscatter": scene.analytic.backscatter,
+            "count_law": scene.analytic.count_law,
+            "response_sigma": response_sigma(scene),
+            "gate_start": scene.gate.start,
+            "bin_width": scene.gate.bin_width,
+            "bins": scene.gate.bins,
+            "group_index": scene.medium.group_index,
+        }
         with write_hdf5(path) as file:
             file.attrs.update(attributes)
             file.create_dataset("config", data=scene.to_toml())
@@ -230,10 +244,14 @@ def simulate_analytic(
     _check_truth(truth, scene)
     shape = truth.depth.shape
     maps, table = pixel_maps(
-        scene, view=pixel_directions(scene.camera).reshape(-1, 3), distance=truth.range.reshape(-1),
-        normal=truth.normal.reshape(-1, 3), reflectance=truth.reflectance.reshape(-1), device=device,
+        scene,
+        view=pixel_directions(scene.camera).reshape(-1, 3),
+        distance=truth.range.reshape(-1),
+        normal=truth.normal.reshape(-1, 3),
+        reflectance=truth.reflectance.reshape(-1),
+        device=device,
         backscatter_profile=_profile(scene, backscatter_profile),
-    )  # fmt: skip
+    )
     illuminated, arrival = maps["signal"] > 0, 1e9 * maps["arrival"]
     times = arrival[illuminated] if illuminated.any() else arrival[np.isfinite(arrival)]
     within = (times >= 1e9 * scene.gate.start) & (times < 1e9 * scene.gate.stop)
@@ -245,10 +263,15 @@ def simulate_analytic(
         )
     maps["background_probability"], flat = _background(scene, maps)
     result = AnalyticResult(
-        scene=scene, truth=truth, **{name: values.reshape(shape) for name, values in maps.items()},
-        depth=np.empty((0, *shape), np.float32), labels=np.empty((0, *shape), np.bool_), seed=seed,
-        _flat_share=flat.astype(np.float32), _table=table,
-    )  # fmt: skip
+        scene=scene,
+        truth=truth,
+        **{name: values.reshape(shape) for name, values in maps.items()},
+        depth=np.empty((0, *shape), np.float32),
+        labels=np.empty((0, *shape), np.bool_),
+        seed=seed,
+        _flat_share=flat.astype(np.float32),
+        _table=table,
+    )
     depth, labels = result.sample(frames, device=device)
     return replace(result, depth=depth, labels=labels)
 
@@ -325,9 +348,13 @@ class AnalyticFile:
             count = len(file.stored("depth", np.float32, (None, *shape)))
             file.stored("labels", np.bool_, (count, *shape))
             return cls(
-                path=Path(path), frames=count, seed=file.integer("seed"), scene=scene, truth=Truth(**arrays["truth"]),
+                path=Path(path),
+                frames=count,
+                seed=file.integer("seed"),
+                scene=scene,
+                truth=Truth(**arrays["truth"]),
                 maps=arrays["maps"],
-            )  # fmt: skip
+            )
 
     def __repr__(self) -> str:
         height, width = self.truth.depth.shape

@@ -148,13 +148,16 @@ def _plan_row(scene: Scene, options: dict[str, Any]) -> PlanRow:
     known = math.inf if found.pulses_for in ("floor", "out of reach") else told
     least, most = (known * pulses for pulses in found.pulses_range)
     return PlanRow(
-        pulses=known * found.pulses, pulses_least=least, pulses_most=most, frame_time=known * found.frame_time,
+        pulses=known * found.pulses,
+        pulses_least=least,
+        pulses_most=most,
+        frame_time=known * found.frame_time,
         pulse_energy=found.scene.laser.pulse_energy,
         sigma_depth=told * found.pilot.bound / math.sqrt(scene.pulses_per_depth_frame),
         floor=told * math.hypot(found.pilot.floor[found.method], found.pilot.pile_up[found.method]),
         largest_range=found.largest_range if found.unjudged_ranges is None else math.nan,
         limit=found.limit if found.judged else f"not judged: {found.more_photons}",
-    )  # fmt: skip
+    )
 
 
 # Values to vary

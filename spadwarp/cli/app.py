@@ -171,7 +171,9 @@ def note(text: str) -> None:
 
 
 def complain(text: str, kind: str = "") -> None:
-    """Prints to stderr, each line behind its kind: error, warning or note."""
+    """Prints to stderr, each line behind its kind: error, warning or, but with --quiet, note."""
+    if kind == "note" and running.quiet:
+        return
     typer.echo("\n".join(f"{kind}: {line}" for line in text.splitlines()) if kind else text, err=True)
 
 
@@ -188,9 +190,13 @@ def fail(text: str, code: int = FAILED) -> NoReturn:
 
 # Help in plain text: units in square brackets stay, and nothing is loaded to draw boxes.
 app = typer.Typer(
-    cls=_Commands, no_args_is_help=True, add_completion=True, pretty_exceptions_enable=False, rich_markup_mode=None,
+    cls=_Commands,
+    no_args_is_help=True,
+    add_completion=True,
+    pretty_exceptions_enable=False,
+    rich_markup_mode=None,
     context_settings={"help_option_names": ["-h", "--help"]},
-)  # fmt: skip
+)
 
 
 def _version(asked: bool) -> None:

@@ -76,10 +76,9 @@ def detect(
     check_outputs(out, ("frames.h5", "frame.png"), inputs=(run,), needed=needed + (16 << 20))
     if overrides:
         opt.warn_of(scene)
-    recording = spadwarp.frames.record_frames(
-        result, out / "frames.h5", pulses=pulses, frames=frames, seed=seed, methods=methods, undo_pile_up=coates,
-        tags=tags, window=recorded, device=device, progress=progress("frames"),
-    )  # fmt: skip
+    options: dict[str, Any] = {"pulses": pulses, "frames": frames, "seed": seed, "methods": methods, "tags": tags}
+    options |= {"undo_pile_up": coates, "window": recorded, "device": device, "progress": progress("frames")}
+    recording = spadwarp.frames.record_frames(result, out / "frames.h5", **options)
     for text in (*recording.file.notes, *_bound_noise(recording, result.photons)):
         complain(text, "note")
     files = [recording.file.path, spadwarp.viz.draw(recording.file, out / "frame.png", pixel=pixel)]
@@ -121,7 +120,10 @@ def _recorded(recording: Recording, frames: int) -> dict[str, Any]:
     median = float(np.median(bound)) if bound.size else math.inf
     per_pixel = recording.detections / (frames * file.shape[1] * file.shape[2])
     return {
-        "pulses": file.pulses, "frames": frames, "seed": file.seed, "detections_per_frame_and_pixel": per_pixel,
+        "pulses": file.pulses,
+        "frames": frames,
+        "seed": file.seed,
+        "detections_per_frame_and_pixel": per_pixel,
         "detections_per_pulse_and_pixel": per_pixel / file.pulses,
         "bound": {
             "pixels": int(bound.size),
@@ -131,7 +133,7 @@ def _recorded(recording: Recording, frames: int) -> dict[str, Any]:
         "depth": {name: dataclasses.asdict(error) for name, error in recording.errors.items()},
         "noise_ratio": file.target_noise_ratio if math.isfinite(file.target_noise_ratio or 0.0) else None,
         "notes": list(file.notes),
-    }  # fmt: skip
+    }
 
 
 def _bound_noise(recording: Recording, photons: int) -> list[str]:
@@ -193,16 +195,19 @@ def depth(
 
     facts, files = opt.read_measured(inputs)
     seen = {name: facts.get(name) for name in _SEEN}
+    if ply is not None and ply.suffix.lower() != ".ply" and not spadwarp.io.is_stream(ply):
+        wrong(f"{ply}: points are written as .ply", "--ply")
     place = spadwarp.files.locate(path)
     reduced = spadwarp.files.stored_depth(spadwarp.load(place)) if spadwarp.files.is_own_file(place) else None
     if reduced is None:
         facts = {name: value for name, value in facts.items() if name not in _SEEN}
         histograms = read_histograms(place, channel=channel, **facts)
+        if ply is not None and histograms.scene is None and seen["horizontal_fov_deg"] is None:
+            wrong(f"{path} has no field of view, which points need: --input horizontal_fov_deg=60", "--ply")
         for text in histograms.notes:
             complain(text, "note")
     pixels = histograms.values[..., 0].size if reduced is None else reduced.values.size
-    names = [f"{quantity}.{ending}" for quantity in ("depth", "range") for ending in ("npy", "exr", "png")]
-    names.append("significance.npy")
+    names = [f"{one}.{ending}" for one in ("depth", "range") for ending in ("npy", "exr", "png")] + ["significance.npy"]
     level, known = _background(background)
     check_outputs(out, names, files={"--ply": ply}, inputs=(path, level, *files), needed=32 * pixels)
     if reduced is None:
@@ -212,15 +217,14 @@ def depth(
             complain(text, "note")
     comment = f"{path.name}, {reduced.method}"
     files = spadwarp.files.write_depth(reduced, out, ply=ply, ply_frame=ply_frame, comment=comment)
-    found = reduced.first[np.isfinite(reduced.first)]
-    metres = [float(of(found)) for of in (np.min, np.max, np.median)] if found.size else None
-    summary = {"pixels_with_return": int(found.size), "metres": metres, "quantity": reduced.quantity}
-    if 2 * found.size < pixels and min_significance != 0:
-        complain(
-            f"{pixels - found.size} of {pixels} pixels have no significant return and so no depth; "
-            "--min-significance 0 gives every pixel one, `spadwarp denoise` uses the pixels around it",
-            "note",
-        )
+    found = reduced.values[np.isfinite(reduced.values)]
+    of_all: dict[str, Any] = {"min": np.min, "median": np.median, "max": np.max}
+    metres = {name: float(of(found)) for name, of in of_all.items()} if found.size else None
+    summary = {"pixels": pixels, "pixels_with_return": int(found.size), "metres": metres, "quantity": reduced.quantity}
+    if 2 * found.size < pixels and min_significance != 0 and reduced.method != "stored":
+        text = "--min-significance 0 gives every pixel one, `spadwarp denoise` uses the pixels around it"
+        text = f"{pixels - found.size} of {pixels} pixels have no significant return and so no depth; {text}"
+        complain(text, "note")
     answer({**summary, "frames": reduced.frames, "files": files})
 
 
@@ -371,8 +375,8 @@ def _of_pixels(one: EstimateMap) -> str:
 
 
 _ENDINGS = (".npy", "_target.npy", "_confidence.npy", "_significance.npy", "_second.npy", ".exr", ".png")
-_OF_IMAGES = {"group_index": opt.real_number, "channel": str, "scale": opt.real_number, "as_depth": bool}
-_DenoiseInputs = Annotated[dict[str, Any], opt.items(opt.MEASURED | _OF_IMAGES)]
+_OF_IMAGES = {"channel": str, "scale": opt.real_number, "as_depth": bool}
+_DenoiseInputs = Annotated[dict[str, Any], opt.items(opt.MEASURED | _SEEN | _OF_IMAGES)]
 
 
 @command()
@@ -434,20 +438,19 @@ def denoise(
     paths = depth_files(path)
     stems = [one.stem for one in paths]
     if twice := sorted({one for one in stems if stems.count(one) > 1}):
-        raise FileError(f"{path}: several files are called {twice[0]!r} and would overwrite each other's results")
+        raise FileError(f"{path}: results of several files would be called {twice[0]!r}; name one of the files")
     needed = sum(one.stat().st_size for one in paths if one.is_file())
     names = [stem + ending for stem in stems for ending in _ENDINGS]
     level, known = _background(background)
     check_outputs(out, names, inputs=(*paths, profile, level, weights, *files), needed=needed)
     settings: dict[str, Any] = {"model": model, "gate": depths, "weights": weights, "device": device, "mask": mask}
-    settings["min_significance"] = min_significance
-    settings["background"] = known
+    settings |= {"min_significance": min_significance, "background": known, "precision": precision}
     settings["profile"] = None if profile is None else spadwarp.io.read_npy(profile, largest=1 << 20)
     lines: dict[str, str] = {}
     summary: list[dict[str, Any]] = []
     for number, one in enumerate(paths, 1):
         try:
-            done = denoise_file(one, out, precision=precision, **settings, **facts)
+            done = denoise_file(one, out, **settings, **facts)
         except (ConfigError, FileError, ArgumentError) as error:
             text = str(error) if str(one) in str(error) else f"{one}: {error}"
             if len(paths) == 1:

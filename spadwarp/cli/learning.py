@@ -59,7 +59,9 @@ def dataset(
         found = spadwarp.dataset.make_dataset(read, out, progress=progress("frames"), **common)
     summary = {"folder": found.folder, "frames": found.frames, "made": list(found.made), "kept": len(found.kept)}
     summary |= {"broken": list(found.broken), "missing": len(found.missing)}
-    answer(summary, shown={**summary, "made": f"{count(len(found.made))} shards"})
+    shown = {"folder": found.folder, "made": f"{count(len(found.made))} shards, {count(found.frames)} frames"}
+    shown["kept"] = f"{count(len(found.kept))} shards" + ", complete before" * (not found.made and not found.missing)
+    answer(summary, shown={**shown, "broken": summary["broken"], "missing": summary["missing"]})
 
 
 @command()

@@ -117,10 +117,22 @@ def plan(
     for text in _warnings(read, but="targets" if range_ else ""):
         complain(text)
     found = spadwarp.plan(
-        read, depth_error=depth_error, time=time, ranges=range_, margin=margin, method=method, full_power=full_power,
-        eye_distance=eye_distance, eye_exposure=eye_exposure, photons="auto" if photons is None else photons,
-        seed=seed, largest_range=not no_range, channel=channel, device=device, progress=progress(),
-    )  # fmt: skip
+        read,
+        depth_error=depth_error,
+        time=time,
+        ranges=range_,
+        margin=margin,
+        method=method,
+        full_power=full_power,
+        eye_distance=eye_distance,
+        eye_exposure=eye_exposure,
+        photons="auto" if photons is None else photons,
+        seed=seed,
+        largest_range=not no_range,
+        channel=channel,
+        device=device,
+        progress=progress(),
+    )
     files = [] if write is None else [write]
     for file in files:
         made = f"# Proposed by `spadwarp plan {scene.name} --depth-error {depth_error:g}`: {_verdict(found)}\n\n"
@@ -311,14 +323,19 @@ def _budget_cells(row: BudgetRow) -> dict[str, Any]:
         return count(float(f"{value:.3g}")) if 100.0 <= value < 1e7 else short(value)
 
     return {
-        "range [m]": f"{row.range:.4g}", "optical depth": row.optical_depth,
+        "range [m]": f"{row.range:.4g}",
+        "optical depth": row.optical_depth,
         "gate [ns]": f"{1e9 * row.gate_start:.4g}-{1e9 * row.gate_stop:.4g}{'*' if row.gate_moved else ' '}",
-        "pulses": pulses(row.pulses), "signal": row.signal, "background": row.background, "α": row.alpha,
-        "signal/backscatter": row.signal_to_backscatter, "σ* [ps]": sigma(1e12 * row.sigma_time),
+        "pulses": pulses(row.pulses),
+        "signal": row.signal,
+        "background": row.background,
+        "α": row.alpha,
+        "signal/backscatter": row.signal_to_backscatter,
+        "σ* [ps]": sigma(1e12 * row.sigma_time),
         "σ* [mm]": sigma(1e3 * row.sigma_depth),
         "outliers": "-" if math.isnan(share) else "< 0.001 %" if 0 < share < 1e-5 else f"{100 * share:.3g} %",
         "for 1 cm": "never" if math.isinf(row.pulses_for_1cm) else pulses(row.pulses_for_1cm),
-    }  # fmt: skip
+    }
 
 
 def _plan_cells(row: PlanRow, pulses: int) -> dict[str, Any]:

@@ -146,8 +146,14 @@ def simulate(
     # Ray reports the loss of a worker on stdout, which is for results.
     with redirect_stdout(sys.stderr), _while_pictures_load(progress(), read) as report:
         result = spadwarp.simulate(
-            read, photons=None if earlier is None or asked is None else read.transport.photons, time=time,
-            device=devices, engine=engine, progress=report, relative_error=relative_error, derivatives=names,
+            read,
+            photons=None if earlier is None or asked is None else read.transport.photons,
+            time=time,
+            device=devices,
+            engine=engine,
+            progress=report,
+            relative_error=relative_error,
+            derivatives=names,
             run=spadwarp.RunOptions(
                 threads=threads,
                 first_photon=first_photon,
@@ -156,7 +162,7 @@ def simulate(
                 checkpoint=out / spadwarp.files.CHECKPOINT if checkpoint > 0 else None,
                 checkpoint_every=checkpoint,
             ),
-        )  # fmt: skip
+        )
     if (reconstruct or automatic) and result.batches > 1:
         note("the light is reconstructed")
         result = spadwarp.reconstruct(result, device=device)
@@ -432,9 +438,13 @@ def analytic(
         raise ArgumentError(f"frames = {frames} is outside [0, inf)")
     opt.warn_of(read)
     result = spadwarp.simulate_analytic(
-        read, truth=spadwarp.result.load_truth_exr(camera=read.camera, **maps) if maps else None, frames=min(frames, 1),
-        seed=seed, device=device, backscatter_profile=None if profile is None else opt.load_run(profile),
-    )  # fmt: skip
+        read,
+        truth=spadwarp.result.load_truth_exr(camera=read.camera, **maps) if maps else None,
+        frames=min(frames, 1),
+        seed=seed,
+        device=device,
+        backscatter_profile=None if profile is None else opt.load_run(profile),
+    )
     files = [result.save(out / "analytic.h5", frames=frames, device=device)]
     files.append(spadwarp.viz.draw(result, out / "analytic.png"))
     notes = spadwarp.analytic.model_notes(read)

@@ -182,9 +182,13 @@ def _show_report(report: Mapping[str, Any]) -> None:
         memory = result["tally_bytes"] if result["memory"] is None else result["memory"]
         error = result["error_per_root_second"]
         cells = {
-            "case": result["case"], "faces": result["faces"] or "-", "setup [s]": result["setup"],
-            "compile [s]": result["compile"], "run [s]": min(result["seconds"]), "per second": f"{rate:.3g} {unit}",
-        }  # fmt: skip
+            "case": result["case"],
+            "faces": result["faces"] or "-",
+            "setup [s]": result["setup"],
+            "compile [s]": result["compile"],
+            "run [s]": min(result["seconds"]),
+            "per second": f"{rate:.3g} {unit}",
+        }
         cells |= {f"{unit}/s": result["rates"].get(unit, math.nan) for unit in ("collisions", "queries")}
         cells["memory"] = "-" if memory is None else in_bytes(memory) + ("*" if result["memory"] is None else "")
         table.append({**cells, "error": "-" if error is None else f"{100 * error:.3g} %"})

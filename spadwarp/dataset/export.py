@@ -113,8 +113,8 @@ class _Source:
         self._numbers = {name: base.scene_numbers(name) for name in ("pulses", "photons")}
         bins = base.histogram_bins
         chosen = tuple(fields) if fields else (*_DEFAULT, *(("features",) if bins else ()))
-        if unknown := [name for name in chosen if name not in EXPORT_FIELDS]:
-            raise ArgumentError(f"fields: {unknown[0]!r} is not one of {', '.join(map(repr, EXPORT_FIELDS))}")
+        for name in chosen:
+            check_choice("fields", name, [*EXPORT_FIELDS])
         if not bins and (lost := [name for name in chosen if name in _OF_HISTOGRAMS]):
             raise ArgumentError(f"fields: {lost[0]!r}: no scene of {folder} was traced: it has no histograms")
         if "polarisation" in chosen and "polarisation" not in base.histogram_fields:

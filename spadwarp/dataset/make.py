@@ -88,7 +88,7 @@ def read_manifest(folder: str | os.PathLike[str]) -> dict[str, Any]:
     if file_problem(path) == "no such file":
         if file_problem(path.parent / "recipe.toml") is None:
             raise FileError(f"{folder}: not finished; `spadwarp dataset` makes the missing shards")
-        raise FileError(f"{folder}: no dataset there (no manifest.json)")
+        raise FileError(f"{folder}: no dataset there (no manifest.json); `spadwarp dataset` makes one")
     manifest = read_json(path, largest=_LARGEST_MANIFEST)
     if not isinstance(manifest, dict) or manifest.get("format") != "spadwarp dataset":
         raise FileError(f"{path}: not the manifest of a spadwarp dataset")

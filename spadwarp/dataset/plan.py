@@ -19,6 +19,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from spadwarp.dataset.recipe import SPLITS, UNIFORM, Distribution, Plume, Recipe, Targets
+from spadwarp.io.paths import similar
 from spadwarp.mesh import BUILTINS, builtin_names, load_target
 from spadwarp.mesh.files import USD_ENDINGS
 from spadwarp.mesh.targets import placement
@@ -26,7 +27,7 @@ from spadwarp.result import Truth, load_truth_exr
 from spadwarp.scene import Camera, Scene, Target, Trajectory, load_trajectory
 from spadwarp.scene.pose import rotation_angles
 from spadwarp.scene.sight import port_advance
-from spadwarp.values import ConfigError, FileError, MeshError, time_from_range
+from spadwarp.values import ConfigError, FileError, MeshError, suggestion, time_from_range
 
 __all__ = ["Plan"]
 
@@ -123,7 +124,8 @@ def find_targets(recipe: Recipe) -> tuple[TargetSource, ...]:
     names = [] if chosen.meshes or chosen.exports else [n for n in known if n not in BUILTINS or n == "staircase"]
     if chosen.builtin != "all":
         names, listed = list(chosen.builtin), ", ".join(map(repr, known))
-        problems += [f"targets.builtin: {name!r} is not one of {listed}" for name in names if name not in known]
+        wrong = [f"{name!r} is not one of {listed}{suggestion(name, known)}" for name in names if name not in known]
+        problems += [f"targets.builtin: {text}" for text in wrong]
     sources: dict[str, tuple[Path | None, Path | None]] = dict.fromkeys(names, (None, None))
     meshes = [(path.stem, (path, None)) for path in _files(chosen.meshes, "", _MESH_ENDINGS, MeshError)]
     exports = [
@@ -138,7 +140,8 @@ def find_targets(recipe: Recipe) -> tuple[TargetSource, ...]:
     for split in ("validation", "test"):
         for name in getattr(chosen, split):
             if name not in splits:
-                problems.append(f"targets.{split}: {name!r} is not one of the dataset's targets")
+                listed = f"{', '.join(map(repr, splits))}{suggestion(name, [*splits])}"
+                problems.append(f"targets.{split}: {name!r} is not one of the dataset's targets, {listed}")
             elif splits[name] != "train":
                 problems.append(f"targets.{split}: {name!r} is already in {splits[name]}")
             else:
@@ -160,7 +163,8 @@ def _files(
         found = [one for one in files if one == path or (one.stem.endswith(ending) and one.suffix.lower() in suffixes)]
         if not found:
             what = "mesh file" if not ending else f"file *{ending}.EXR"
-            raise error(f"targets.{'exports' if ending else 'meshes'}: {path}: no {what} there")
+            problem = f"no {what} there" if path.exists() else f"no such file or folder{similar(path)}"
+            raise error(f"targets.{'exports' if ending else 'meshes'} = {path}: {problem}")
         yield from found
 
 
@@ -278,16 +282,14 @@ class Plan:
 
     def scene(self, index: int) -> SceneDraw:
         """Draws a scene."""
-        recipe, split = self.recipe, self.split_of(index)
+        recipe, pose, split = self.recipe, self.recipe.pose, self.split_of(index)
         number = index // recipe.scenes_per_target
         source = self.targets[number]
 
         def draw(field: str, distribution: Distribution | None) -> Any:
             return None if distribution is None else distribution.draw(self.generator(split, field, index))
 
-        distance = (
-            self._export_distance(source) if source.export else float(draw("pose.distance", recipe.pose.distance))
-        )
+        distance = self._export_distance(source) if source.export else float(draw("pose.distance", pose.distance))
         changes = {name: draw(f"vary.{name}", values) for name, values in recipe.vary.items()}
         scene = Scene.from_dict(self._tables, source=recipe.source).with_overrides(changes)
         if (lengths := draw("water.attenuation_lengths", recipe.water.attenuation_lengths)) is not None:

@@ -102,8 +102,8 @@ class FrameReader:
             self.path = self.path.parent.parent if self.path.parent.name == "scenes" else self.path.parent
         self.manifest = read_manifest(self.path)
         check_choice("split", split, (*SPLITS, "all"))
-        if unknown := [name for name in fields if name not in FIELDS]:
-            raise ArgumentError(f"fields: {unknown[0]!r} is not one of {', '.join(map(repr, FIELDS))}")
+        for name in fields:
+            check_choice("fields", name, [*FIELDS])
         repeats, seed = check_integer("repeats", repeats, "[1, 1000000000]"), check_integer("seed", seed, SEED)
         self.split, self.fields, self.repeats, self.seed = split, tuple(fields), repeats, seed
         self.augment, self.epoch = augment, 0

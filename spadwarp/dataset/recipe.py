@@ -32,6 +32,7 @@ Paths = Annotated[Names, FilePath()]
 class Distribution(Section):
     """One of `choices`, equally likely, or uniform between `low` and `high`."""
 
+    numeric: ClassVar[bool] = True
     choices: Annotated[tuple[Any, ...], BeforeValidator(listed)] = ()
     low: float | None = field(None, "lowest value", "[-1e19, 1e19]")
     high: float | None = field(None, "highest value", "[-1e19, 1e19]")
@@ -143,6 +144,7 @@ class Plume(Section):
     cells: Whole = field(32, "cells along the edges of its box", "[1, 256]")
 
 
+_EXTINCTION = ("medium.preset", "medium.extinction", "medium.absorption", "medium.scattering")
 _MOST_TRIED = 1000  # values of a field that varies
 
 SPLITS = ("train", "validation", "test")
@@ -284,11 +286,13 @@ class Recipe(Document):
         camera = self.scene.get("camera")
         polarisation = camera.get("polarisation", "none") if isinstance(camera, Mapping) else "none"
         if self.monte_carlo.channel != "I" and polarisation == "none" and "camera.polarisation" not in self.vary:
-            yield (
-                f"monte_carlo.channel = {self.monte_carlo.channel!r} needs scene.camera.polarisation = 'analyser' or "
-                "'stokes'"
-            )
+            needed = "scene.camera.polarisation = 'analyser' or 'stokes'"
+            yield f"monte_carlo.channel = {self.monte_carlo.channel!r} needs {needed}"
+        if not self.targets.exports and self.gate.before.limits[1] >= (far := self.pose.distance.limits[1]):
+            yield f"gate.before = {self.gate.before.limits[1]:g} is outside (0, {far:g}) m, up to pose.distance"
         for name in self.vary:
+            if self.water.attenuation_lengths is not None and name in _EXTINCTION:
+                yield f"vary.{name} cannot be combined with water.attenuation_lengths, which replaces its extinction"
             if name in ("camera.width", "camera.height") or name.split(".")[0] in ("gate", "targets"):
                 yield f"vary.{name} cannot vary"
 

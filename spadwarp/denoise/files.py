@@ -17,7 +17,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from spadwarp.dataset import FrameReader, read_manifest
 from spadwarp.dataset.shards import SceneFile
-from spadwarp.denoise.baselines import FROM_COUNTS
+from spadwarp.denoise.baselines import BASELINES, FROM_COUNTS
 from spadwarp.denoise.frames import MARGIN, checked_gate
 from spadwarp.denoise.histograms import CountFrames, dim_pixels, target_bins, without_defects
 from spadwarp.denoise.inference import (
@@ -32,12 +32,13 @@ from spadwarp.denoise.network_files import Precision, require_torch, weights_met
 from spadwarp.denoise.recipe import TrainingRecipe, load_training_recipe
 from spadwarp.files import Held, gate_of, holds_own_file, is_own_file, load, locate, sequence, stored_depth
 from spadwarp.frames.backgrounds import BackgroundLaw
-from spadwarp.frames.depth import FARTHEST, Method, Quantity, depth_of
+from spadwarp.frames.depth import FARTHEST, Method, Quantity, depth_of, geometry, with_view
 from spadwarp.frames.file import SequenceFile
 from spadwarp.frames.measured import Histograms, read_histograms, stored_images
 from spadwarp.io.arrays import read_exr, write_exr
 from spadwarp.io.paths import atomic_path, existing_file
 from spadwarp.result import Result
+from spadwarp.scene.sections import file_of
 from spadwarp.scene.sight import depth_from_time
 from spadwarp.transport import PhotonRecords
 from spadwarp.values import ArgumentError, FileError, SpadwarpWarning, check_real, percent, range_from_time
@@ -52,6 +53,7 @@ if TYPE_CHECKING:
 
 ENDINGS = (".h5", ".hdf5", ".exr", ".npy", ".mat", ".ptu")
 
+_JUDGED = 1 << 19  # pixels, of which is told whether a denoiser makes them worse
 _EXR_CHANNELS = ("Z", "depth", "range", "A", "Depth.Z", "Depth.V")
 
 
@@ -78,7 +80,6 @@ def read_depth(
     method: Method | None = None,
     background: ArrayLike | BackgroundLaw | None = None,
     gate: tuple[float, float] | None = None,
-    group_index: float | None = None,
     device: str | None = None,
     **measured: Any,
 ) -> DepthReading:
@@ -100,9 +101,9 @@ def read_depth(
         background: Of counts whose response is known, as `spadwarp.denoise.estimate` takes it, replacing the file's;
             default: the file's, else "decay".
         gate: (start, stop) in depth [m]; of counts whose response is known, only the bins within it are used.
-        group_index: Of measured histograms, see `depth_of`; default: that of the file.
         device: Warp device of the estimator.
-        measured: What a file of measured histograms does not say, as `read_histograms` takes it.
+        measured: What a file of measured histograms does not say, as `read_histograms` takes it, and `group_index` and
+            `horizontal_fov_deg`, as `depth_of` does.
 
     Raises:
         FileError: No such file, not readable, or without depth.
@@ -131,7 +132,7 @@ def read_depth(
         if stored.dtype.kind not in "iuf":
             raise FileError(f"{place}: {stored.dtype} {stored.shape}; depth is real numbers")
         others = ["background"] * (background is not None)
-        if given := [*(name.replace("_", " ") for name in measured if name != "dataset"), *others]:
+        if given := [*(name.replace("_", " ") for name in measured if name not in ("dataset", "group_index")), *others]:
             raise ArgumentError(f"{place} holds depth: {', '.join(given)} are of histograms")
         depth = stored.astype(np.float32)
         below = np.count_nonzero(depth < 0)
@@ -143,7 +144,7 @@ def read_depth(
         source = "depth as it is" + (f": {chosen}" if chosen else "")
         source += f"; {below} values below 0 count as not reported" if below else ""
         return DepthReading(depth=frames, frames=depth.ndim == 3, gate=None, profile=None, source=source)
-    histograms = _read_histograms(place, measured | of_result, group_index)
+    histograms = _read_histograms(place, measured | of_result)
     counted = histograms.values.dtype.kind in "iu" and histograms.response is not None
     if counted:
         histograms = _with_background(histograms, background)
@@ -154,15 +155,13 @@ def read_depth(
     return dataclasses.replace(_estimate_depth(histograms, counted, method, device), truth=truth)
 
 
-def _read_histograms(path: Path, measured: dict[str, Any], group_index: float | None) -> Histograms:
-    histograms = read_histograms(path, **measured)
+def _read_histograms(path: Path, measured: dict[str, Any]) -> Histograms:
+    view = [measured.pop(name, None) for name in ("group_index", "horizontal_fov_deg")]
+    histograms = with_view(read_histograms(path, **measured), *view)
     notes = histograms.notes
     if histograms.scene is None and histograms.response is None:
         notes += ("the instrument response is not given (irf): with it, counts are denoised with their histograms",)
-    if group_index is not None and histograms.scene is not None:
-        raise ArgumentError(f"{path}: the file has its own group_index")
-    group_index = histograms.group_index if group_index is None else group_index
-    return dataclasses.replace(histograms, group_index=group_index, notes=notes)
+    return dataclasses.replace(histograms, notes=notes)
 
 
 def _with_background(held: Histograms, given: ArrayLike | BackgroundLaw | None) -> Histograms:
@@ -228,20 +227,21 @@ def _estimate_depth(histograms: Histograms, counted: bool, method: Method | None
     depth = reduced.values.astype(np.float32)
     depth[depth <= 0.0] = np.nan  # a peak of noise at the time of the pulse
     dim = [] if counted else dim_pixels(histograms)
+    source = "; ".join([f"{reduced.quantity} by {method} from histograms", *histograms.notes, *dim])
     return DepthReading(
-        depth=depth, quantity=reduced.quantity, frames=reduced.frames > 1,
-        gate=(range_from_time(histograms.gate_start, index), range_from_time(gate_stop, index)),
-        profile=backscatter_profile(histograms),
-        source="; ".join([f"{reduced.quantity} by {method} from histograms", *histograms.notes, *dim]),
+        depth=depth, quantity=reduced.quantity, frames=reduced.frames > 1, profile=backscatter_profile(histograms),
+        gate=(range_from_time(histograms.gate_start, index), range_from_time(gate_stop, index)), source=source,
         histograms=histograms if counted else None,
     )  # fmt: skip
 
 
 def depth_at(time: NDArray[np.float64], histograms: Histograms) -> NDArray[np.float64]:
-    """Depth [m] at times of flight `[..., H, W]` [s]; range where the camera is not known."""
-    if histograms.scene is None:
-        return range_from_time(time, float(histograms.group_index or 1.0))
-    return depth_from_time(time, scene=histograms.scene)
+    """Depth [m] at times of flight `[..., H, W]` [s]; range where the view is not known."""
+    if histograms.scene is not None:
+        return depth_from_time(time, scene=histograms.scene)
+    index, lines = geometry(histograms)
+    distance = range_from_time(time, index)
+    return distance if lines is None else lines.depth_from_range(distance)
 
 
 def _within(held: Histograms, gate: tuple[float, float]) -> Histograms:
@@ -337,6 +337,8 @@ def denoise_file(
     if folder.resolve() == Path(path).resolve().parent:
         raise ArgumentError(f"out = {folder} is the folder of {path}; another is needed: nothing is overwritten")
     mask = None if mask is None else check_real("mask", mask, "[0, 1]")
+    if model not in BASELINES:
+        require_torch()  # before the work begins
     read = read_depth(path, gate=gate, **reading)
     notes, gate = [read.source], gate or read.gate
     valid = read.depth[np.isfinite(read.depth) & (read.depth > 0)]
@@ -371,12 +373,12 @@ def denoise_file(
     if empty := np.count_nonzero(np.isnan(depth).all(axis=(1, 2))):
         notes.append(f"{empty} of {len(depth)} frames are empty: nothing was reported, or no target is seen")
     if second is not None:
-        share = percent(np.isfinite(second).mean())
-        notes.append(f"{share} % of the pixels have a second return, of a surface or of light scattered into them")
+        some = f"{percent(np.isfinite(second).mean())} % of {second.size} pixels have"
+        notes.append(f"{some} a second return, of a surface or of light scattered into them")
     threshold = target_threshold(model) if mask is None else mask
     shown = found.masked(threshold)[0]
     files = _write(folder, name, read, Estimate(depth, *found[1:]), second, model)
-    notes += _worse(read.depth, depth, model)
+    notes += _worse(read.depth, depth, model, gate)
     if model == "usdn" and weights is None:
         notes.append("usdn, for comparison: its depths are off by 1 to 3 cm even without noise; pyramid is better")
     style: dict[str, Any] = {"quantity": read.quantity, "title": f"{Path(path).name}: {model}"}
@@ -387,17 +389,27 @@ def denoise_file(
     )  # fmt: skip
 
 
-def _worse(depth: NDArray[np.float32], found: NDArray[np.float32], model: str) -> list[str]:
-    """A note where pixels move by more than the noise of the input, which second differences of neighbours show."""
-    bends = (np.abs(np.diff(depth, 2, axis=axis)) for axis in (1, 2))
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore")  # all NaN
-        noise = min(float(np.nanmedian(bend)) / (0.6745 * 6**0.5) if bend.size else np.nan for bend in bends)
-        moved = float(np.nanmedian(np.abs(found - depth)))
-    if not moved > max(1.2 * noise, 1e-4):
+def _worse(depth: NDArray[np.float32], found: NDArray[np.float32], model: str, gate: tuple[float, float]) -> list[str]:
+    """A note where depths move by more than the noise of the input: half of them, and the hundredth that moves most.
+
+    On surfaces of the input alone, where of 5 × 5 pixels half of the depths, five or more, are within a hundredth of
+    the gate from their median. From it a pixel's noise is measured, also of one that reported backscatter.
+    """
+    depth, found = (one[: max(1, _JUDGED // depth[0].size)] for one in (depth, found))
+    padded = np.pad(depth, ((0, 0), (2, 2), (2, 2)), constant_values=np.nan)
+    around = np.lib.stride_tricks.sliding_window_view(padded, (5, 5), (1, 2)).reshape(*depth.shape, 25)
+    ascending = np.sort(around, axis=-1)  # NaN last
+    reported = np.isfinite(ascending).sum(axis=-1, keepdims=True)
+    middle = np.take_along_axis(ascending, np.maximum(reported - 1, 0) // 2, axis=-1)
+    agreeing = (np.abs(ascending - middle) < 0.01 * (gate[1] - gate[0])).sum(axis=-1, keepdims=True)
+    pair = np.abs([depth - middle[..., 0], found - depth])
+    surface = (agreeing >= np.maximum(5, 0.5 * reported))[..., 0] & np.isfinite(pair).all(axis=0)
+    noise, moved = np.quantile(pair[:, surface], (0.5, 0.99), axis=1).T if surface.any() else np.zeros((2, 2))
+    if not ((moved > 1.8 * noise).all() and moved[0] > 1e-4):
         return []
-    text = f"worse: the input's noise is {1e3 * noise:.2g} mm, but half of the pixels moved by {1e3 * moved:.2g} mm"
-    return [text if model == "pyramid" else f"{text}; model pyramid is more accurate"]
+    usual = 1e3 * noise[0] / 0.6745  # standard deviation
+    text = f"worse: the input's noise is {usual:.2g} mm, but half of the pixels moved by {1e3 * moved[0]:.2g} mm"
+    return [text if model in ("pyramid", "histograms") else f"{text}; model pyramid is more accurate"]
 
 
 def _write(
@@ -481,7 +493,8 @@ def train(
         recipe = load_training_recipe(recipe)
     training = validation = None
     if recipe.data is not None:
-        training, validation = (read_scenes(recipe.data, split) for split in ("train", "validation"))
+        with file_of("data"):
+            training, validation = (read_scenes(recipe.data, split) for split in ("train", "validation"))
     trained = fit(recipe, training, validation, Path(out), device=device, progress=progress, notify=notify)
     if trained.log.is_file() and trained.log.stat().st_size:
         log = [json.loads(line) for line in trained.log.read_text().splitlines()]

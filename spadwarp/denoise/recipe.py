@@ -30,10 +30,8 @@ def _ordered(limits: tuple[float, float]) -> tuple[float, float]:
 
 
 Share = Annotated[float, Field(ge=0, le=1)]
-Spread = Annotated[float, Field(ge=0, le=100)]
 Above0 = Annotated[float, Field(ge=1e-9, le=1e9)]
 _CHECKS = BeforeValidator(listed), AfterValidator(_ordered)
-Limits = Annotated[tuple[Spread, Spread], *_CHECKS]
 Positive = Annotated[tuple[Above0, Above0], *_CHECKS]
 Shares = Annotated[tuple[Share, Share], *_CHECKS]
 
@@ -62,11 +60,13 @@ class Noise(Section):
     sbr: Positive = Field((0.03, 8.0), description="of these, signal over background counts, uniform in the logarithm")
     scattered: Share = Field(0.0, description="of these, samples with forward-scattered light, delayed and spread")
     delay: Positive = Field(
-        (0.004, 0.12), description="mean delay of that light [gate widths], uniform in the logarithm"
+        (0.004, 0.12), description="its mean delay [gate widths], uniform in the logarithm; on the way back less"
     )
     spread: Positive = Field((0.5, 20.0), description="its spread over the image [pixels], uniform in the logarithm")
     halo: Share = Field(0.0, description="of these, samples with an optical depth of 0.01 to 3, mostly a halo")
-    roughness: Limits = Field((0.0, 0.0), description="standard deviation of that light's logarithm from bin to bin")
+    events: Positive = Field(
+        (1e6, 1e6), description="of that light in a pixel, uniform in the logarithm: few in Monte Carlo histograms"
+    )
     ambient: Share = Field(0.0, description="of these, samples with ambient light, which follows the reflectance")
     two_returns: Share = Field(0.4, description="of these, samples in which pixels see a weaker second surface")
     wrong: Share = Field(

@@ -618,7 +618,7 @@ def _draw_counts(
     add(second, shade * share)
     scattered = round(noise.scattered * len(clean))
     if scattered:
-        rate[:scattered] = _scattered(rate[:scattered], noise, generator)
+        rate[:scattered] = _scattered(rate[:scattered], photons[:scattered], noise, generator)
     rate = torch.bmm(rate.flatten(1, 2), toeplitz(true, bins).mT).view_as(rate)
     from_before = (edges[:-1] < (reach * bins)[..., None]) | ambient[:, None, None, None]
     rate += level[:, None, None] * bright[..., None] * from_before
@@ -652,15 +652,14 @@ def _estimate(counts: Tensor, level: Tensor, response: Tensor, photons: Tensor) 
     return highest(score), counts.sum(dim=-1) > 0
 
 
-def _scattered(rate: Tensor, noise: Noise, generator: torch.Generator) -> Tensor:
-    """The signal rate `[B, h, w, T]` with a part of it scattered forward.
+def _scattered(rate: Tensor, photons: Tensor, noise: Noise, generator: torch.Generator) -> Tensor:
+    """The signal rate `[B, h, w, T]` with a part of it scattered forward, before it met the target and afterwards.
 
-    Light that water scatters by θ at a distance d before the target seems to come from d θ beside it, and its path is
-    longer by d θ² / 2. So light from near is as early as the target's, and the delay grows with the spread. Single
-    scattering by a lobe of phase function gives a radiance that falls as 1 / φ within the lobe and as 1 / φ³ outside:
-    here three Gaussians, whose widths and mean delays grow by the same factor. The part of the light follows from the
-    optical depth. Energy is conserved, except for what leaves the gate. The rate may be rough, as histograms of a
-    simulation with few photons are.
+    What water scatters at a distance d before a target of range D is seen φ beside it on a path that is longer by
+    φ² D (D − d) / 2 d: light from near the camera is as early as the target's. So at every φ the delay is mostly far
+    less than before. Single scattering by a lobe of phase function gives a radiance that falls as 1 / φ within it and
+    as 1 / φ³ outside: here three Gaussians. The part of the light follows from the optical depth. Energy is conserved,
+    except for what leaves the gate. The light beside may come in few `events`, as in Monte Carlo histograms.
     """
     size, height, width, bins = rate.shape
     device, random = rate.device, Random(size, generator)
@@ -678,16 +677,17 @@ def _scattered(rate: Tensor, noise: Noise, generator: torch.Generator) -> Tensor
         return weight / weight.sum(dim=2, keepdim=True)
 
     delay, scale = random.log_between(noise.delay, 1, 1), random.log_between(noise.spread, 1, 1)
-    first = delayed(delay * random.uniform(1, 1))  # of light that is scattered several times
     growth, parts = random.log_between((2.0, 5.0), 1, 1), random.uniform(3)
-    light = torch.zeros_like(rate)
-    for power, part in zip((-1, 0, 1), (parts / parts.sum(dim=1, keepdim=True)).unbind(dim=1), strict=True):
-        factor = growth**power
-        late = torch.bmm(rate.flatten(1, 2), delayed(delay * factor) @ first).view_as(rate)
-        across = torch.matmul(spread(width, scale * factor)[:, None], late)
-        light += part[:, None, None, None] * torch.bmm(spread(height, scale * factor), across.flatten(2)).view_as(rate)
-    rough = random.between(noise.roughness, 1, 1)[..., None]
-    light *= random.normal(*rate.shape[1:]).mul_(rough).sub_(0.5 * rough.square()).exp_()
     thin = 1.0 - torch.exp(-random.log_between((0.01, 3.0), 1, 1))
     share = torch.where(random.coin(noise.halo, 1, 1), thin, random.uniform(1, 1))
+    late, early = delayed(delay), delayed(delay / growth.square())
+    rate = torch.lerp(rate.flatten(1, 2), torch.bmm(rate.flatten(1, 2), late), share)
+    back = torch.bmm(rate, torch.lerp(early, late, random.uniform(1, 1) / growth)).unflatten(1, (height, width))
+    rate, light = rate.view_as(back), torch.zeros_like(back)
+    for power, part in zip((-1, 0, 1), (parts / parts.sum(dim=1, keepdim=True)).unbind(dim=1), strict=True):
+        factor = scale * growth**power
+        across = torch.matmul(spread(width, factor)[:, None], back)
+        light += part[:, None, None, None] * torch.bmm(spread(height, factor), across.flatten(2)).view_as(rate)
+    event = (photons / random.log_between(noise.events))[:, None, None, None] * random.normal(*rate.shape[1:3], 1).exp()
+    light = torch.poisson(light.div_(event), generator=generator).mul_(event)
     return torch.lerp(rate, light, share[..., None])

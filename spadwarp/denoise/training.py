@@ -34,7 +34,7 @@ from spadwarp.values import ConfigError, FileError
 
 # The samples: clean scenes, and which noisy crops of them each step learns from.
 
-_OPEN = (0.03, 0.85)  # part of a scene that is target, where it counts as a target in open water
+_OPEN = (0.03, 0.5)  # part of a scene that is target, where it counts as a target in open water
 
 
 class Samples:

@@ -255,7 +255,7 @@ def evaluate(
         SpadwarpError: A package of the extra `denoise` is missing.
     """
     for name in models:
-        check_choice("models: an item", name, METHODS)
+        check_choice("models", name, [one for one in METHODS if one not in FROM_COUNTS or one == name])
     wanted = [name for name in dict.fromkeys(models) if name != "bm3d"] + ["bm3d"] * (bm3d_frames > 0)
     if counting := [name for name in wanted if name in FROM_COUNTS]:
         raise ArgumentError(

@@ -25,7 +25,7 @@ from spadwarp.denoise.inference import Estimate, estimate_frames, target_thresho
 from spadwarp.denoise.network_files import compared
 from spadwarp.denoise.recipe import LEVELS
 from spadwarp.evaluation.datasets import Steps, near_jumps, staircase_steps
-from spadwarp.values import ArgumentError
+from spadwarp.values import ArgumentError, check_choice
 
 __all__ = ["SceneScores", "evaluate_scenes"]
 
@@ -302,9 +302,8 @@ def evaluate_scenes(
         seed: Of the noise.
         weights, device, progress: See `evaluate`, as for errors.
     """
-    if unknown := [name for name in models if name not in METHODS or name in FROM_COUNTS]:
-        known = [name for name in METHODS if name not in FROM_COUNTS]
-        raise ArgumentError(f"models: {unknown[0]!r} is not one of {', '.join(known)}, the methods for depth frames")
+    for name in models:
+        check_choice("models", name, [one for one in METHODS if one not in FROM_COUNTS])
     if scenes is None:
         scenes = [evaluation_scene(shape, setting) for setting in SETTINGS for shape in SHAPES]
     chosen, methods = list(scenes), compared(["input", *models], weights)

@@ -21,8 +21,8 @@ from spadwarp.scene import Scene
 from spadwarp.transport import simulate
 from spadwarp.values import range_from_time
 
-RENDERED_PHOTONS = 200_000
-"""Photons of a rendered scene: a few seconds on two cores."""
+RENDERED_PHOTONS = 4_000_000
+"""Photons of a rendered scene, some seconds on two cores. With 2e5 the light beside a target was of single events."""
 
 _Image = NDArray[np.float64]
 

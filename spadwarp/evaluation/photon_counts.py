@@ -227,7 +227,7 @@ def photon_sweep(
         SpadwarpError: The result has no return, no backscatter or no instrument response.
     """
     for model in models:
-        check_choice("models: an item", model, METHODS)
+        check_choice("models", model, METHODS)
     for name, values in (("photons", photons), ("sbr", sbr)):
         check_integer(f"number of {name}", len(values), "[1, 10000]")
         for value in values:

@@ -224,7 +224,7 @@ def write_depth(
     """
     check_choice("ply_frame", ply_frame, tuple(_POINT_FRAMES))
     if ply is not None and reduction.lines is None:
-        raise ArgumentError("a point cloud needs the horizontal field of view")
+        raise ArgumentError("a point cloud needs the horizontal field of view (horizontal_fov_deg)")
     if ply is not None and ply_frame == "world" and reduction.camera is None:
         raise ArgumentError("points in the world need the pose of the camera: those of a measurement are in its frame")
     folder, name = Path(directory), reduction.quantity

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 import warnings
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, Literal
 
@@ -48,6 +48,7 @@ class Histograms:
     bin_width: float | None = None  # [s]
     gate_start: float = 0.0  # time of flight at the lower edge of bin 0 [s]
     group_index: float | None = None  # of the water, where there is no scene
+    horizontal_fov_deg: float | None = None  # of a measuring camera with square pixels
     background: NDArray[np.float32] | None = None
     """Expected background in the unit of `values`, of a shape that `arrival_time` takes."""
     level_known: bool = True  # whether it is known apart from these values
@@ -284,16 +285,16 @@ def depth_of(
     values, filtered = histograms.values, method in ("matched", "likelihood")
     height, width = values.shape[-3:-1]
     response = histograms.response if filtered else histograms.irf
-    group_index = histograms.group_index if group_index is None else group_index
+    histograms = with_view(histograms, group_index, horizontal_fov_deg)
     missing = {
         "bin width is missing (bin_width): the file does not hold it": histograms.bin_width,
         "group index is missing (group_index): 1 in air, 1.3566 in fresh water, 1.3638 in seawater": histograms.scene
-        or group_index,
+        or histograms.group_index,
         f"method = {method!r} needs an instrument response (irf)": response if filtered else "",
     }
     if any(value is None for value in missing.values()):
         raise ArgumentError("; ".join(text for text, value in missing.items() if value is None))
-    index, lines = _geometry(histograms, group_index, horizontal_fov_deg)
+    index, lines = geometry(histograms)
     counted = values.dtype.kind in "iu"
     window = () if histograms.scene is not None else (_window(histograms, index),)
     notes: tuple[str, ...] = ()
@@ -321,11 +322,15 @@ def depth_of(
     distance = 0.5 * path if lines is None else lines.range_from_path(path)
     return Reduction(
         quantity="range" if lines is None else "depth",
-        values=distance if lines is None else lines.depth_from_range(distance), range=distance,
-        intensity=values.sum(axis=-1).reshape(-1, height, width), lines=lines, method=method,
+        values=distance if lines is None else lines.depth_from_range(distance),
+        range=distance,
+        intensity=values.sum(axis=-1).reshape(-1, height, width),
+        lines=lines,
+        method=method,
         camera=None if histograms.scene is None else histograms.scene.camera,
-        significance=None if significance is None else significance.reshape(-1, height, width), notes=(*notes, *window),
-    )  # fmt: skip
+        significance=None if significance is None else significance.reshape(-1, height, width),
+        notes=(*notes, *window),
+    )
 
 
 def _window(histograms: Histograms, index: float) -> str:
@@ -355,19 +360,24 @@ def _check_background(counts: NDArray[Any], background: ArrayLike) -> None:
         warnings.warn(f"{text}; it is that of each bin in all pulses of a frame", SpadwarpWarning, stacklevel=3)
 
 
-def _geometry(
-    histograms: Histograms, group_index: float | None, horizontal_fov_deg: float | None
-) -> tuple[float, LinesOfSight | None]:
+def with_view(histograms: Histograms, group_index: float | None, horizontal_fov_deg: float | None) -> Histograms:
+    """With what the file of a measurement does not say. Raises `ArgumentError` for that of a scene."""
+    view = {"group_index": group_index, "horizontal_fov_deg": horizontal_fov_deg}
+    given: dict[str, Any] = {name: value for name, value in view.items() if value is not None}
+    if given and histograms.scene is not None:
+        raise ArgumentError(f"the file has its own {' and '.join(given)}")
+    return replace(histograms, **given)
+
+
+def geometry(histograms: Histograms) -> tuple[float, LinesOfSight | None]:
     """Group index, and lines of sight where they are known."""
-    scene = histograms.scene
+    scene, fov = histograms.scene, histograms.horizontal_fov_deg
     if scene is not None:
-        if group_index is not None or horizontal_fov_deg is not None:
-            raise ArgumentError("group index and field of view are those of the file's scene")
         return scene.medium.group_index, lines_of_sight(scene)
-    index = check_real("group index", group_index, field_range(Medium, "group_index"))
-    if horizontal_fov_deg is None:
+    index = check_real("group index", histograms.group_index, field_range(Medium, "group_index"))
+    if fov is None:
         return index, None
-    check_real("horizontal field of view", horizontal_fov_deg, field_range(Camera, "horizontal_fov_deg"))
+    check_real("horizontal field of view", fov, field_range(Camera, "horizontal_fov_deg"))
     height, width = histograms.values.shape[-3:-1]
-    camera = Camera(width=width, height=height, horizontal_fov_deg=horizontal_fov_deg, aperture_diameter=1.0)
+    camera = Camera(width=width, height=height, horizontal_fov_deg=fov, aperture_diameter=1.0)
     return index, lines_of_camera(camera)

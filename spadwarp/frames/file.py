@@ -214,10 +214,14 @@ class FramesFile(_StoredFrames):
     def frame(self, number: int) -> Frames:
         """One frame as `Frames`. Raises `ArgumentError` where it is not there."""
         return Frames(
-            counts=self.counts(number)[None], frames=1, first_frame=number, expected=self.expected,
-            background=self.background, detector=self.scene.detector,
+            counts=self.counts(number)[None],
+            frames=1,
+            first_frame=number,
+            expected=self.expected,
+            background=self.background,
+            detector=self.scene.detector,
             **{name: getattr(self, name) for name in _OF_A_FRAME},
-        )  # fmt: skip
+        )
 
     def bound_depth(self) -> Map:
         """Cramér–Rao bound of one frame [m], `[H, W]`; NaN where there is no information."""

@@ -37,6 +37,7 @@ ENDINGS = (*_ARRAYS, ".ptu")
 
 _LEAST_BINS = 8  # of a histogram that is worth one
 _CLEARLY = 2.0  # as far from a square as the other order of axes, and the choice is clear
+_LEAST_RESPONSE = 0.02  # bins: shorter ones are not used for timing
 _MOST_BINS = 1_000_000  # as of a scene's gate
 _MOST_VALUES = 1 << 29  # 2 GiB of counts
 _TIMES = {"tag_unit": "(0, 1e-3) s", "bin_width": "(0, 1e-3) s", "gate_start": "[-1, 1] s"}
@@ -132,16 +133,17 @@ def read_histograms(
         origin = f"{'tag' if raw.first else 'bin'} 0 is taken for the time of the pulse"
         warnings.warn(f"{path.name}: gate start is not given (gate_start): {origin}", SpadwarpWarning, stacklevel=2)
     bin_width = _fact("bin_width", bin_width, raw.bin_width, path)
-    if irf is not None and bin_width is not None and not irf.fwhm < (length := values.shape[-1] * bin_width):
-        raise ArgumentError(
-            f"{path}: irf = {irf.fwhm:.4g} s (full width at half maximum) is outside [0, {length:.4g}) s: the "
-            f"histograms are {length:.4g} s long; with a unit, write irf=300ps"
-        )
+    if irf is not None and bin_width is not None:
+        _check_response(irf, bin_width, values.shape[-1] * bin_width, path)
     return Histograms(
-        values=np.ascontiguousarray(values), bin_width=bin_width,
+        values=np.ascontiguousarray(values),
+        bin_width=bin_width,
         gate_start=(_fact("gate_start", gate_start, raw.gate_start, path) or 0.0) + raw.first,
-        group_index=raw.group_index, irf=irf, response=irf, notes=tuple(notes),
-    )  # fmt: skip
+        group_index=raw.group_index,
+        irf=irf,
+        response=irf,
+        notes=tuple(notes),
+    )
 
 
 def _fact(name: str, given: float | None, held: float | None, path: Path) -> float | None:
@@ -149,6 +151,16 @@ def _fact(name: str, given: float | None, held: float | None, path: Path) -> flo
     if given is None and held is not None and held not in Interval.read(_TIMES[name]):
         raise ArgumentError(f"{path}: {name} = {held:g} is outside {_TIMES[name]}; give it, such as {name}=55ps")
     return held if given is None else given
+
+
+def _check_response(irf: InstrumentResponse, bin_width: float, length: float, path: Path) -> None:
+    """Refuses a response longer than the histograms [s], and warns of one far shorter than a bin."""
+    if not irf.fwhm < length:
+        text = f"irf = {irf.fwhm:.4g} s (full width at half maximum) is outside [0, {length:.4g}) s, the length of the"
+        raise ArgumentError(f"{path}: {text} histograms; with a unit, write irf=300ps")
+    if irf.fwhm < _LEAST_RESPONSE * bin_width:
+        pair = f"irf = {irf.fwhm * 1e12:.4g} ps is {irf.fwhm / bin_width:.2g} of bin_width = {bin_width * 1e12:.4g} ps"
+        warnings.warn(f"{path.name}: {pair}; one of the two may be of another unit", SpadwarpWarning, stacklevel=3)
 
 
 def is_own(path: Path) -> bool:
@@ -162,30 +174,41 @@ def _read_own(path: Path, channel: Channel) -> Histograms:
             raise ArgumentError(f"channel = {channel!r}: {path} holds frames, whose channel was chosen when drawn")
         file = FramesFile.load(path)
         return Histograms(
-            values=file.counts(), bin_width=file.bin_width, gate_start=file.gate_start,
-            background=file.background * np.float32(file.pulses),
-            pulses=file.pulses if file.scene.detector.mode == "first_photon" else 0, irf=file.irf, response=file.irf,
+            values=file.counts(),
+            bin_width=file.bin_width,
+            gate_start=file.gate_start,
             scene=file.scene,
-        )  # fmt: skip
+            irf=file.irf,
+            response=file.irf,
+            background=file.background * np.float32(file.pulses),
+            pulses=file.pulses if file.scene.detector.mode == "first_photon" else 0,
+        )
     result = analyser_channel(load_result(path), channel)
     scene = result.scene
     return Histograms(
-        values=result.expected(), notes=tuple(filter(None, [noise_problem(result)])), bin_width=scene.gate.bin_width,
-        gate_start=scene.gate.start, background=result.expected("backscatter").astype(np.float32),
-        response=detector_response(scene.detector, scene.laser), scene=scene,
-    )  # fmt: skip
+        values=result.expected(),
+        bin_width=scene.gate.bin_width,
+        gate_start=scene.gate.start,
+        scene=scene,
+        response=detector_response(scene.detector, scene.laser),
+        notes=tuple(filter(None, [noise_problem(result)])),
+        background=result.expected("backscatter").astype(np.float32),
+    )
 
 
 def _checked(values: NDArray[Any], path: Path) -> NDArray[Any]:
     if values.ndim not in (3, 4) or values.size == 0 or values.dtype.kind not in "biuf":
-        needed = "real numbers [H, W, T] or [frames, H, W, T] are needed"
-        raise FileError(f"{path}: {values.dtype} {values.shape}; {needed}")
+        needed = "real numbers [H, W, T] or [frames, H, W, T], one or more, are needed"
+        hint = "; reshape [pixels, T] to [H, W, T]" if values.ndim == 2 else ""
+        raise FileError(f"{path}: {values.dtype} {values.shape}; {needed}{hint}")
     if values.dtype.kind == "f" and np.isnan(values).any():
-        raise FileError(f"{path}: holds NaN, as depth does; histograms are finite and not negative")
+        raise FileError(f"{path}: holds NaN, as depth does (as_depth of denoise); histograms are finite, not negative")
     if values.dtype.kind in "if" and not (values.min() >= 0 and math.isfinite(values.max())):
         raise FileError(f"{path}: holds {values.min()} … {values.max()}; finite values, not negative, are needed")
     if values.dtype.kind in "iu" and values.max() >= 2**31:
         raise FileError(f"{path}: holds counts up to {values.max()}; a bin of a frame is in [0, {2**31 - 1}]")
+    if not values.any():
+        warnings.warn(f"{path.name}: holds no counts: all {values.size} values are 0", SpadwarpWarning, stacklevel=3)
     return values
 
 
@@ -201,27 +224,28 @@ def _check_size(shape: Sequence[int], instead: str) -> None:
 
 def _ordered(values: NDArray[Any], axes: str | None) -> tuple[NDArray[Any], list[str]]:
     """Histograms `[H, W, T]` or `[frames, H, W, T]` from any order of axes, and a note of what was inferred."""
-    letters, notes = "yxt" if values.ndim == 3 else "nyxt", []
-    if axes is None:
-        axes = _inferred(values.shape, letters)
-        notes = [f"axes: {_in_words(values.shape, axes)} (axes = {axes})"]
-    elif sorted(axes) != sorted(letters):
-        raise ArgumentError(f"axes = {axes!r} are not the letters of {letters} in any order, for shape {values.shape}")
-    return np.transpose(values, [axes.index(letter) for letter in letters]), notes
+    letters, shape = "yxt" if values.ndim == 3 else "nyxt", values.shape
+    orders = (letters, letters.replace("yxt", "tyx"))
+    usual, note = _inferred(shape, orders), ""
+    if axes is None and usual is None:
+        choices = " or ".join(f"{order} ({_in_words(shape, order)})" for order in orders)
+        raise ArgumentError(f"the order of the axes is missing (axes): shape {shape} may be {choices}")
+    chosen = axes or usual or ""
+    if sorted(chosen) != sorted(letters):
+        raise ArgumentError(f"axes = {axes!r} are not the letters of {letters} in any order, for shape {shape}")
+    if usual is not None and usual.index("t") != chosen.index("t"):
+        note = f"; {usual} would be usual for {shape}: {_in_words(shape, usual)}"
+    text = f"axes: {_in_words(shape, chosen)} (axes = {chosen}){note}"
+    return np.transpose(values, [chosen.index(letter) for letter in letters]), [text]
 
 
-def _inferred(shape: tuple[int, ...], letters: str) -> str:
-    """Bins last or, before the image, first: the order whose image is clearly nearer to a square."""
-    orders, ratio = (letters, letters.replace("yxt", "tyx")), {}
-    for order in orders:
-        size = dict(zip(order, shape, strict=True))
-        if size["t"] >= _LEAST_BINS:
-            ratio[order] = max(size["y"], size["x"]) / max(min(size["y"], size["x"]), 1)
+def _inferred(shape: tuple[int, ...], orders: Sequence[str]) -> str | None:
+    """Bins last or, before the image, first: the order whose image is clearly nearer to a square, if any."""
+    sizes = {order: dict(zip(order, shape, strict=True)) for order in orders}
+    usable = {order: size for order, size in sizes.items() if size["t"] >= _LEAST_BINS}
+    ratio = {order: max(size["y"] / size["x"], size["x"] / size["y"]) for order, size in usable.items()}
     best = sorted(ratio, key=lambda order: ratio[order])
-    if len(best) == 1 or (best and ratio[best[0]] * _CLEARLY <= ratio[best[1]]):
-        return best[0]
-    choices = " or ".join(f"{order} ({_in_words(shape, order)})" for order in orders)
-    raise ArgumentError(f"the order of the axes is missing (axes): shape {shape} may be {choices}")
+    return best[0] if len(best) == 1 or (best and ratio[best[0]] * _CLEARLY <= ratio[best[1]]) else None
 
 
 def _in_words(shape: tuple[int, ...], axes: str) -> str:
@@ -257,9 +281,8 @@ def _arrays(path: Path) -> Iterator[dict[str, Variable]]:
 
 def _listed(variables: Mapping[str, Variable]) -> str:
     kinds = {"dense": "", "sparse": " sparse", "cell": " cells"}
-    return (
-        ", ".join(f"{k or 'one without name'} {v.shape}{kinds[v.kind]}" for k, v in variables.items()) or "no numbers"
-    )
+    listed = (f"{name or 'one without name'} {one.shape}{kinds[one.kind]}" for name, one in variables.items())
+    return ", ".join(listed) or "no numbers"
 
 
 def _unnamed(path: Path, variables: Mapping[str, Variable]) -> ArgumentError:
@@ -305,7 +328,8 @@ def _read_arrays(
     notes = [f"reads {name}{others}"] if name and not dataset and (others or not is_mat) else []
     if chosen.kind == "cell":
         if tag_unit is None:
-            raise ArgumentError(f"{path}: the unit of the time tags in {name} is missing (tag_unit)")
+            needed = "tag_unit=8ps,bin_width=64ps,gate_start=0,group_index=1.3566,irf=300ps"
+            raise ArgumentError(f"{path}: the unit of the time tags in {name} is missing (tag_unit); usual is {needed}")
         return _of_tags(value, tag_unit, bin_width, notes)
     width = numbers.get("bin_size", numbers.get("bin_width"))
     if bin_width is None and width is not None:

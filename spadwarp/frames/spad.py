@@ -148,9 +148,13 @@ class Receiver:
             rates = noise.numpy() + np.broadcast_to(values, shape[:2]).reshape(-1)
             noise = wp.array(rates.astype(np.float32), dtype=wp.float32, device=noise.device)
         matrix = response_matrix(
-            detector_response(detector, laser) if irf is None else irf, source_start=axis[0], source_width=axis[1],
-            source_bins=shape[2], edges=seen.start + seen.edges, period=seen.period if detector.wrap else None,
-        )  # fmt: skip
+            detector_response(detector, laser) if irf is None else irf,
+            source_start=axis[0],
+            source_width=axis[1],
+            source_bins=shape[2],
+            edges=seen.start + seen.edges,
+            period=seen.period if detector.wrap else None,
+        )
         image, even = (shape[0], shape[1]), tdc_widths is None
         return cls(detector=detector, window=seen, image=image, noise=noise, matrix=matrix, equal_bins=even)
 
@@ -554,10 +558,20 @@ def detect(
     elif scene is not None:
         notes += (UNKNOWN_NOISE,)
     return Frames(
-        counts=counts, expected=expected, background=known, gate_start=seen.start, bin_width=axis[1],
-        edges=seen.edges[: seen.recorded + 1], period=seen.period if detector.wrap else None, irf=irf, tags=found,
-        detector=detector, notes=notes, target_noise_ratio=ratio, **numbers,
-    )  # fmt: skip
+        counts=counts,
+        expected=expected,
+        background=known,
+        gate_start=seen.start,
+        bin_width=axis[1],
+        edges=seen.edges[: seen.recorded + 1],
+        period=seen.period if detector.wrap else None,
+        irf=irf,
+        tags=found,
+        detector=detector,
+        notes=notes,
+        target_noise_ratio=ratio,
+        **numbers,
+    )
 
 
 def _draw(
@@ -577,11 +591,17 @@ def _draw(
     found = None
     if by_event:
         counts, events = kernels.event_counts(
-            hazard, edges=window.edges, recorded=window.recorded, period=window.period,
-            gated=detector.mode != "free_running", dead_time=detector.dead_time_ns * 1e-9,
+            hazard,
+            edges=window.edges,
+            recorded=window.recorded,
+            period=window.period,
+            gated=detector.mode != "free_running",
+            dead_time=detector.dead_time_ns * 1e-9,
             afterpulsing_probability=detector.afterpulsing_probability,
-            afterpulsing_time_constant=detector.afterpulsing_time_constant_ns * 1e-9, tags=tags, **common,
-        )  # fmt: skip
+            afterpulsing_time_constant=detector.afterpulsing_time_constant_ns * 1e-9,
+            tags=tags,
+            **common,
+        )
         if events is not None:
             frame, pixel = np.divmod(events["row"], receiver.image[0] * receiver.image[1])
             y, x = np.divmod(pixel, receiver.image[1])

@@ -265,10 +265,16 @@ def solve(
     pixel_bound = 0.5 * (inverse + inverse.transpose(0, 2, 1)) + right @ bound @ right.transpose(0, 2, 1)
     pixels[~known], pixel_bound[~known], pixel_covariance[~known] = np.nan, np.nan, np.nan
     return Solution(
-        shared=shared, pixels=pixels, information=0.5 * (matrix + matrix.T), covariance=covariance,
-        simulation=simulation, pixel_covariance=pixel_covariance, pixel_bound=pixel_bound, simulation_share=share,
+        shared=shared,
+        pixels=pixels,
+        information=0.5 * (matrix + matrix.T),
+        covariance=covariance,
+        simulation=simulation,
+        pixel_covariance=pixel_covariance,
+        pixel_bound=pixel_bound,
+        simulation_share=share,
         gain=gain,
-    )  # fmt: skip
+    )
 
 
 def _of_batches(parts: Sequence[Floats], mixing: Floats, own: NDArray[np.intp]) -> tuple[Floats, Floats]:

@@ -113,9 +113,13 @@ def read_exposure(counts: Any, scene: Scene, *, pulses: int | None = None, **fac
         if cube.shape[1] != gated:
             raise ArgumentError(f"{name}: {cube.shape[1]} bins; the detector has {gated} in the scene's gate")
     return Exposure(
-        counts=cube, pulses=pulses * frames, window=(start, cube.shape[1]), tdc_widths=widths, irf=irf,
+        counts=cube,
+        pulses=pulses * frames,
+        window=(start, cube.shape[1]),
+        tdc_widths=widths,
+        irf=irf,
         noise_ratio=None if noise is None else noise * frames,
-    )  # fmt: skip
+    )
 
 
 def _added_up(values: Any, scene: Scene, name: str) -> tuple[NDArray[np.int64], int]:

@@ -212,10 +212,16 @@ class Renderer:
             detector = detector.model_copy(update={"ambient_rate": 0.0})
             ambient = rates if ambient is None else ambient + rates
         return Receiver.of(
-            detector, scene.laser, shape=(camera.height, camera.width, gate.bins), axis=(gate.start, gate.bin_width),
-            irf=self.exposure.irf, window=self.exposure.window, tdc_widths=self.exposure.tdc_widths, ambient=ambient,
+            detector,
+            scene.laser,
+            shape=(camera.height, camera.width, gate.bins),
+            axis=(gate.start, gate.bin_width),
+            irf=self.exposure.irf,
+            window=self.exposure.window,
+            tdc_widths=self.exposure.tdc_widths,
+            ambient=ambient,
             device=pick_device(self.device),
-        )  # fmt: skip
+        )
 
     def _placed(self, scene: Scene, values: Values) -> _PlacedReceiver:
         receiver = self._receiver(scene, values)

@@ -49,17 +49,19 @@ def example_or_path(path: str | os.PathLike[str], kind: str) -> Path:
         named = f"{place.name}.toml"
         close = [named] if os.path.exists(named) else difflib.get_close_matches(place.name, known, n=1)
         hint = f"did you mean {close[0]!r}?" if close else f"known are {', '.join(known)}"
-        raise FileError(f"{place}: neither a file nor one of the {kind} that come with spadwarp; {hint}")
+        raise FileError(f"{place}: neither a file nor one of `spadwarp list {kind}`; {hint}")
     return known[place.name]
 
 
 def similar(path: str | os.PathLike[str]) -> str:
     """Addition to an error about a missing file, `; did you mean 'planned.toml'?`: one beside it, of that ending if
-    there are some, or that of its name in the current folder."""
+    there are some, or that of its name in the current folder; of a folder what it holds."""
     place = Path(path)
     if place.is_absolute() and Path(place.name).is_file():
         return f"; there is a {place.name} in the current folder: the paths in a file begin at that file's folder"
     try:
+        if os.path.isdir(place):
+            return f"; it is a folder, which holds {', '.join(sorted(os.listdir(place))[:6]) or 'nothing'}"
         beside = os.listdir(place.parent)
     except (OSError, ValueError):
         return ""

@@ -64,11 +64,20 @@ def analyser_channel(result: Result, channel: Channel) -> Result:
     cube = cubes_of(result, "channels").get(channel)
     moments = None if cube is None or cube.second_moment is None else cube.second_moment.copy()
     return replace(
-        result, scene=_behind_analyser(result.scene) if of_polarisation else lines_left_out, tallies=tallies, unit=unit,
-        half=None, second_moment=moments, batch_size=0 if moments is None else result.batch_size,
-        batches=0 if moments is None else result.batches, batch_moments={}, reconstruction=None, channel_tallies=None,
-        derivative_tallies=None, provenance={**result.provenance, "channel": channel},
-    )  # fmt: skip
+        result,
+        scene=_behind_analyser(result.scene) if of_polarisation else lines_left_out,
+        tallies=tallies,
+        unit=unit,
+        half=None,
+        second_moment=moments,
+        batch_size=0 if moments is None else result.batch_size,
+        batches=0 if moments is None else result.batches,
+        batch_moments={},
+        reconstruction=None,
+        channel_tallies=None,
+        derivative_tallies=None,
+        provenance={**result.provenance, "channel": channel},
+    )
 
 
 def pixel_channel(result: Result, channel: Channel, row: int, column: int) -> Floats:

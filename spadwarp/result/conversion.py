@@ -84,9 +84,13 @@ def to_torch(source: Any, *, tallies: torch.Tensor | None = None) -> Any:
         raise ArgumentError(f"tallies are {tallies.dtype} {tuple(tallies.shape)}; torch.int64 {shape} is needed")
     maps = {name: _shared(array).to(tallies.device) for name, array in vars(source.truth).items()}
     return TorchResult(
-        scene=source.scene, tallies=tallies.view(shape), unit=source.unit, photons=source.photons,
-        tally_value=_shared(source.tally_value).to(tallies.device), truth=SimpleNamespace(**maps),
-    )  # fmt: skip
+        scene=source.scene,
+        tallies=tallies.view(shape),
+        unit=source.unit,
+        photons=source.photons,
+        tally_value=_shared(source.tally_value).to(tallies.device),
+        truth=SimpleNamespace(**maps),
+    )
 
 
 def _shared(array: Any) -> torch.Tensor:

@@ -163,9 +163,13 @@ def turbulent_field(
 
 _MATTER = field_range(Grid, "extinction")
 GRID_ARRAYS = {
-    "density": Interval.read("[0, 1e9]"), "extinction": _MATTER, "absorption": _MATTER, "scattering": _MATTER,
-    "albedo": field_range(Grid, "albedo"), "anisotropy": field_range(Grid, "anisotropy"),
-}  # fmt: skip
+    "density": Interval.read("[0, 1e9]"),
+    "extinction": _MATTER,
+    "absorption": _MATTER,
+    "scattering": _MATTER,
+    "albedo": field_range(Grid, "albedo"),
+    "anisotropy": field_range(Grid, "anisotropy"),
+}
 """Arrays of a file `[x, y, z]`, or of several frames `[frame, x, y, z]`, and their ranges."""
 _PLACES = {"size": "(0, inf)", "cell_size": "(0, inf)", "origin": "(-inf, inf)"}
 

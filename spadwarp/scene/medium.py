@@ -209,9 +209,11 @@ class Water(Section):
         **dict.fromkeys(COEFFICIENTS, ("chlorophyll", "constituents", "concentrations")),
         "chlorophyll": (*COEFFICIENTS, "preset", "constituents", "concentrations"),
         "constituents": (*COEFFICIENTS, "chlorophyll", *_LAW_FIELDS),
-        "concentrations": (*COEFFICIENTS, "chlorophyll", "anisotropy"), "temperature": ("phase_index", "group_index"),
-        "salinity": ("phase_index", "group_index"), "phase_function": _OWN_FIELDS,
-    }  # fmt: skip
+        "concentrations": (*COEFFICIENTS, "chlorophyll", "anisotropy"),
+        "temperature": ("phase_index", "group_index"),
+        "salinity": ("phase_index", "group_index"),
+        "phase_function": _OWN_FIELDS,
+    }
     preset: str | None = field(None, "a named water, see `spadwarp list presets medium`")
     absorption: float = field(0.0, "absorption coefficient a [1/m]", "[0, 1e6]")
     scattering: float = field(0.0, "scattering coefficient b [1/m]", "[0, 1e6]")

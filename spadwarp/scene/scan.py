@@ -71,9 +71,12 @@ def shots_of(scene: Scene) -> Shots:
     else:
         position, platform = _platform(scene, time)
     return Shots(
-        time=time, position=position, rotation=platform @ _deflections(scene, count),
-        view=pixel_directions(scene.receiver)[0], shape=(camera.height, camera.width),
-    )  # fmt: skip
+        time=time,
+        position=position,
+        rotation=platform @ _deflections(scene, count),
+        view=pixel_directions(scene.receiver)[0],
+        shape=(camera.height, camera.width),
+    )
 
 
 def _platform(scene: Scene, time: Floats) -> tuple[Floats, Floats]:

@@ -193,8 +193,13 @@ class Section(_Model):
     """
 
     model_config = ConfigDict(
-        defer_build=True, frozen=True, extra="forbid", strict=True, allow_inf_nan=False, protected_namespaces=(),
-    )  # fmt: skip
+        defer_build=True,
+        frozen=True,
+        extra="forbid",
+        strict=True,
+        allow_inf_nan=False,
+        protected_namespaces=(),
+    )
     section: ClassVar[str] = ""
     """Whose presets it takes."""
     alternatives: ClassVar[tuple[str, ...]] = ()
@@ -381,7 +386,7 @@ def table_of(model: type[BaseModel], name: str) -> type[Section] | None:
 
 def field_unit(info: FieldInfo) -> str | None:
     """The unit of a field's numbers, "1" for a ratio; None where it takes no real numbers."""
-    if not any(part is float for part in parts_of(info)):
+    if not any(part is float or getattr(part, "numeric", False) for part in parts_of(info)):
         return None
     bracketed = re.findall(r"\[([^\]]+)\]", info.description or "")
     return next((unit for unit in bracketed if unit in UNITS), None if bracketed else "1")
@@ -394,7 +399,7 @@ def takes_integers(info: FieldInfo) -> bool:
 
 
 def in_field_unit(value: Any, info: FieldInfo) -> Any:
-    """A text, or the texts of a list, as numbers of the field's unit; NumPy's values as Python's; all else as it is.
+    """A text, or those of a list or table, as numbers of the field's unit; NumPy's values as Python's; others stay.
 
     Raises `ValueError` for a text that begins like a number and is none of the field's unit.
     """
@@ -408,6 +413,8 @@ def in_field_unit(value: Any, info: FieldInfo) -> Any:
             except ValueError as error:
                 raise ValueError(f"holds {item!r}, which {error}") from None
         return type(value)(numbers)
+    if isinstance(value, Mapping):
+        return {name: in_field_unit(item, info) for name, item in value.items()}
     unit = field_unit(info) if isinstance(value, str) and _NUMBER.match(value) else None
     if unit is None:
         return value
@@ -707,6 +714,7 @@ def key_text(key: Sequence[str | int]) -> str:
 # What people write for a field's name, beyond misspellings.
 _SYNONYMS = {"g": "anisotropy", "a": "absorption", "b": "scattering", "c": "extinction", "omega": "albedo"}
 _SYNONYMS |= {"fov": "horizontal_fov_deg", "water": "medium", "light": "laser", "sensor": "camera", "spad": "detector"}
+_SYNONYMS |= {"min": "low", "max": "high"}
 
 _KINDS = {"float_type": "a number", "int_type": "an integer", "int_from_float": "an integer", "tuple_type": "a list"}
 _KINDS |= {"bool_type": "true or false", "string_type": "a string"}

@@ -344,7 +344,7 @@ class Panels:
         height = float(np.clip((self._cell - 0.35) * shape[0] / shape[1], 0.5, 5.0))
         # Titles, numbers and labels.
         self.figure = new_figure(width, lines * (height + 1.1) + sum(below) + 0.45 * bool(below))
-        self.figure.get_layout_engine().set(wspace=0.05, h_pad=0.05)  # type: ignore[call-arg,union-attr]
+        self.figure.get_layout_engine().set(wspace=0.05, h_pad=0.1)  # type: ignore[call-arg,union-attr]
         ratios = [*[height, 0.1] * lines, *below]
         grid = self.figure.add_gridspec(len(ratios), columns, height_ratios=ratios)
         self._free = iter([(grid[2 * k, c], grid[2 * k + 1, c]) for k in range(lines) for c in range(columns)])
@@ -405,8 +405,9 @@ class Panels:
     def show_depth(
         self, image: NDArray[Any], title: str, limits: tuple[float, float], label: str = LABELS["depth"]
     ) -> Axes:
-        """Depth [m]."""
-        return self.show(image, title, label, DEPTH_MAP, limits)
+        """Depth [m]; the label says what is grey."""
+        grey = "\ngrey: no depth" * bool(np.isnan(image).any() and np.isfinite(image).any())
+        return self.show(image, title, label + grey, DEPTH_MAP, limits)
 
     def show_error(self, error: NDArray[Any], title: str) -> None:
         """Signed depth errors [m]; see `error_limit`. How many pixels are beyond the colours is written below."""
@@ -465,16 +466,17 @@ def shown_limits(
     """Lowest and highest value, at least 1 cm apart, without `beyond` percent at each end; the margin is relative.
 
     With `weights`, such as counts, percent of their sum: depths of pixels with hardly any counts are spread over the
-    gate, and those of the target would have one colour.
+    gate, and those of the target would have one colour. A single pixel decides neither end.
     """
     known = np.isfinite(image)
     if weights is not None and (weights[known] > 0).any():  # those of NaN count for nothing
         known &= weights > 0
         each = weights[known].astype(np.float64)
-        ends = np.quantile(image[known], (beyond / 100, 1.0 - beyond / 100), weights=each, method="inverted_cdf")
+        for _ in range(3 * bool(beyond)):
+            each = np.minimum(each, 0.005 * beyond * each.sum())
+        low, high = np.percentile(image[known], (beyond, 100.0 - beyond), weights=each, method="inverted_cdf")
     else:
-        ends = np.percentile(image[known], (beyond, 100.0 - beyond)) if known.any() else np.array([0.0, 1.0])
-    low, high = ends
+        low, high = np.percentile(image[known], (beyond, 100.0 - beyond)) if known.any() else (0.0, 1.0)
     spare = max(0.0, 0.01 - (high - low)) / 2
     spare += margin * (high - low + 2 * spare)
     return float(low - spare), float(high + spare)

@@ -127,12 +127,19 @@ def _of_result(result: Result, method: str | None, device: Any) -> _Page:
     return _Page(
         caption=f"{count(result.photons)} photons{how_made(result)}, seed {result.seed}, {scene.transport.estimator}"
         f"{channel_text(result.provenance.get('channel'))}; expected histograms, before the instrument response",
-        scene=scene, depth=result.depth(method=chosen, device=device), method=chosen, truth=result.truth.depth,
-        sparse=smooth is None, reflectance=result.truth.reflectance, intensity=result.intensity * per_pulse,
+        scene=scene,
+        depth=result.depth(method=chosen, device=device),
+        method=chosen,
+        truth=result.truth.depth,
+        sparse=smooth is None,
+        reflectance=result.truth.reflectance,
+        intensity=result.intensity * per_pulse,
         intensity_label="detections per pulse",
-        layers=[_layer(*style.COMPONENTS[name], cube, scale) for name, cube in cubes], edges=result.bin_edges,
-        unit="detections per pulse and bin", response=detector_response(scene.detector, scene.laser),
-    )  # fmt: skip
+        layers=[_layer(*style.COMPONENTS[name], cube, scale) for name, cube in cubes],
+        edges=result.bin_edges,
+        unit="detections per pulse and bin",
+        response=detector_response(scene.detector, scene.laser),
+    )
 
 
 def _of_frames(file: FramesFile, method: str | None, frame: int) -> _Page:
@@ -224,15 +231,25 @@ def _data(page: _Page) -> dict[str, Any]:
     images = {"depth": depth, "truth": truth, "error": depth - truth, "intensity": intensity}
     images |= {} if page.reflectance is None else {"reflectance": page.reflectance}
     return {
-        "shape": list(depth.shape), "images": {name: _packed(image) for name, image in images.items()},
+        "shape": list(depth.shape),
+        "images": {name: _packed(image) for name, image in images.items()},
         "cloud": [_packed(cloud[..., axis]) for axis in range(3)],
         "arrival": _packed(1e9 * (lines.path_from_range(lines.range_from_depth(truth)) / speed)),
-        "towards": _packed(lines.direction @ laser), "laser": float(laser @ laser), "port": port, "speed": 1e-9 * speed,
-        "method": page.method, "intensityLabel": page.intensity_label, "histograms": histograms, "block": block,
-        "merged": merged, "edges": [round(1e9 * float(edge), 6) for edge in edges], "unit": page.unit,
-        "sparse": page.sparse, "response": _response(page.response),
+        "towards": _packed(lines.direction @ laser),
+        "laser": float(laser @ laser),
+        "port": port,
+        "speed": 1e-9 * speed,
+        "method": page.method,
+        "intensityLabel": page.intensity_label,
+        "histograms": histograms,
+        "block": block,
+        "merged": merged,
+        "edges": [round(1e9 * float(edge), 6) for edge in edges],
+        "unit": page.unit,
+        "sparse": page.sparse,
+        "response": _response(page.response),
         "first": median_pixel(intensity, np.isfinite(depth) & np.isfinite(truth)),
-    }  # fmt: skip
+    }
 
 
 def _histograms(layers: list[dict[str, Any]]) -> tuple[list[dict[str, Any]], int, int]:

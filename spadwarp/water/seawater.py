@@ -94,10 +94,14 @@ def water_optics(
     absorption, scattering = pure_water_absorption(wavelength_nm), pure_water_scattering(wavelength_nm, **water)
     particles, dissolved, scatterers = _case_1(wavelength_nm, chlorophyll) if chlorophyll > 0.0 else (0.0, 0.0, 0.0)
     return WaterOptics(
-        wavelength_nm=float(wavelength_nm), absorption=absorption + particles + dissolved,
-        scattering=scattering + scatterers, water_absorption=absorption, water_scattering=scattering,
-        phase_index=refractive_index(wavelength_nm, **water), group_index=group_index(wavelength_nm, **water),
-    )  # fmt: skip
+        wavelength_nm=float(wavelength_nm),
+        absorption=absorption + particles + dissolved,
+        scattering=scattering + scatterers,
+        water_absorption=absorption,
+        water_scattering=scattering,
+        phase_index=refractive_index(wavelength_nm, **water),
+        group_index=group_index(wavelength_nm, **water),
+    )
 
 
 def refractive_index(wavelength_nm: ArrayLike, *, temperature: ArrayLike = 20.0, salinity: ArrayLike = 35.0) -> Value:

@@ -98,10 +98,16 @@ def test_depth_of_measured_histograms(tmp_path):
 
     seen = ("--input", "horizontal_fov_deg=60", "--ply", tmp_path / "points.ply", "--json", tmp_path / "printed.json")
     depth("seen", *seen)
-    assert tables(tmp_path / "printed.json")["quantity"] == "depth"
+    printed = tables(tmp_path / "printed.json")
+    assert printed["quantity"] == "depth" and printed["metres"]["min"] < printed["metres"]["median"] < 3
     centre = np.load(tmp_path / "seen" / "depth.npy")[1, 1]
     assert centre == pytest.approx(3.0 / np.sqrt(1 + 0.1443**2), rel=2e-3)  # half a pixel off the axis
 
     for given, words in ((facts[1:], "bin width"), (facts[:2], "group index"), (facts[:3], "instrument response")):
         assert words in depth("x", "--method", "matched", facts=given, code=2)
     assert "field of view" in depth("x", "--ply", tmp_path / "p.ply", code=2)
+    assert "written as .ply" in depth("x", *seen[:2], "--ply", tmp_path / "p.txt", code=2)
+
+    np.save(tmp_path / "counts.npy", np.stack([counts, 0 * counts, counts]))  # all frames count
+    assert not depth("three", "--json", tmp_path / "three.json")
+    assert tables(tmp_path / "three.json")["pixels_with_return"] == 24

@@ -75,7 +75,8 @@ def test_what_is_read_is_never_replaced(done, tmp_path):
     refused("view", tmp_path / "link", "--out", source, "--overwrite", words=("does not end in .html",))
     for command in (("merge", done, "--out", done), ("depth", depth, "--out", tmp_path, "--input", "bin_width=100ps")):
         refused(*command, "--overwrite", words=("is read by this command",))
-    refused("depth", done, "--out", tmp_path / "out", "--ply", depth, words=("--ply", "exists"))
+    (tmp_path / "points.ply").touch()
+    refused("depth", done, "--out", tmp_path / "out", "--ply", tmp_path / "points.ply", words=("--ply", "exists"))
     assert (source.read_bytes(), depth.read_bytes()) == before
     for name, options in {"page.html": (), "light.gif": ("--pictures", 3)}.items():
         path = tmp_path / name

@@ -425,6 +425,8 @@ def test_every_problem_of_a_recipe_is_named():
     text = str(caught.value)
     for words in ("pose.distance", "[1e-9, 1e9]", "pose.yaw", "did you mean 'yaw_deg'", "low = 2.0", "1.5", "exposure"):
         assert words in text
+    for given in ("6 m", {"low": "600 cm", "high": 6}, ["6 m", "600 cm"]):
+        assert Recipe.from_dict({**TABLES, "pose": {"distance": given}}).pose.distance.limits == (6.0, 6.0)
     assert "literal[" not in text and "function-" not in text  # pydantic's names of a choice's branches
     # Traced scenes that are described, of which there are none unless it is said so.
     with pytest.raises(spadwarp.ConfigError, match=r"monte_carlo.*share is missing"):
@@ -437,14 +439,17 @@ PLUME = {"probability": 0.5, "optical_depth": {"low": 0.5, "high": 2.0}, "cells"
 LAYERS = [{"start": 1.0, "extinction": 1.0, "albedo": 0.5}]
 WRONG = [
     ({"scene.camera.pixels": 3}, r"camera\.pixels"),
-    ({"targets.test": ["boat"]}, r"targets\."),
+    ({"targets.test": ["carr"]}, r"targets\.test: 'carr' is not one of the dataset's targets, .*; did you mean 'car'"),
+    ({"gate.before": 1500}, r"gate\.before = 1500 is outside \(0, 15\) m, up to pose\.distance"),
+    ({"pose.yaw_deg": {"min": -3}}, "did you mean 'low'"),
+    ({"vary": {"medium.preset": ["uwoc-clear"]}}, "cannot be combined with water.attenuation_lengths"),
     ({"targets.test": ["car"], "targets.validation": ["car"]}, r"targets\."),
     ({"targets.builtin": ["boat"]}, r"targets\."),
     # What varies is tried when the recipe is read.
-    ({"vary": {"medium.extinction": [0.1, NAN]}}, r"vary\.medium\.extinction holds"),
-    ({"vary": {"medium.extinction": [0.1, -1.0]}}, r"vary: medium\.extinction = -1\.0"),
-    ({"vary": {"medium.extinction": {"low": 0.1, "high": 1e7}}}, r"vary: medium\.extinction = 10000000\.0"),
-    ({"vary": {"medium.extinction": {"low": 5e-324, "high": 1.0, "log": True}}}, "too far apart"),
+    ({"vary": {"medium.albedo": [0.1, NAN]}}, r"vary\.medium\.albedo holds"),
+    ({"vary": {"medium.albedo": [0.1, -1.0]}}, r"vary: medium\.albedo = -1\.0"),
+    ({"vary": {"medium.albedo": {"low": 0.1, "high": 1e7}}}, r"vary: medium\.albedo = 10000000\.0"),
+    ({"vary": {"medium.albedo": {"low": 5e-324, "high": 1.0, "log": True}}}, "too far apart"),
     ({"vary": {"laser.preset": ["lu2024", "none"]}}, r"vary: laser\.preset = 'none'"),
     ({"vary": {"x": 3}}, "vary: x is not a known section"),
     ({"vary": {"medium.haze": 3}}, r"vary: medium\.haze is not a known field"),

@@ -145,7 +145,7 @@ def test_features_find_the_return_and_a_second_one(folder):
 
 def test_what_cannot_be_exported_is_named(folder, whole, tmp_path):
     for dataset, arguments, problem in (
-        (folder, {"fields": ("depth",)}, "'depth' is not one of 'noisy'"),
+        (folder, {"fields": ("depth",)}, "fields = 'depth' is not one of 'noisy'"),
         (folder, {"format": "csv"}, "'csv' is not"),
         (whole, {"fields": ("counts",)}, "it has no histograms"),
     ):

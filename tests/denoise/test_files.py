@@ -2,6 +2,7 @@
 
 import json
 import re
+import sys
 
 import h5py
 import numpy as np
@@ -11,7 +12,7 @@ from scipy.io import savemat
 from helpers.cli import run
 from helpers.datasets import make, recipe
 from helpers.stepped_frames import noisy_frame, scene
-from spadwarp import ArgumentError, FileError, SpadwarpWarning
+from spadwarp import ArgumentError, FileError, SpadwarpError, SpadwarpWarning
 from spadwarp.dataset import FrameReader
 from spadwarp.denoise import denoise_file, files
 from spadwarp.denoise.files import read_depth
@@ -106,6 +107,10 @@ def test_histograms_become_depth_first(tmp_path):
     found = denoise_file(path, out, model="median", bin_width=100e-12, gate_start=10e-9, group_index=index)
     assert abs(np.median(found.depth) - 2.0) < 0.005
     assert found.gate == pytest.approx((speed / 2 * 10e-9, speed / 2 * 35.6e-9))
+    facts = {"bin_width": 100e-12, "gate_start": 10e-9, "group_index": index, "horizontal_fov_deg": 60.0}
+    seen = denoise_file(path, tmp_path / "seen", model="pooled", **response(350e-12), **facts)  # planar: z of a sphere
+    tangent = np.tan(np.radians(30.0)) * 2**0.5 * np.array([15.5, 0.5]) / 16
+    assert seen.depth[0, [0, 16], [0, 16]] == pytest.approx(2.0 / np.hypot(1.0, tangent), rel=0.01)
     with pytest.raises(ArgumentError, match="another is needed"):
         denoise_file(path, tmp_path)
     with pytest.raises(ArgumentError, match="bin width is missing"):
@@ -199,6 +204,12 @@ def test_what_cannot_be_read(tmp_path):
             read_depth(tmp_path / name)
     with pytest.raises(FileError, match="no file that ends in"):
         files.depth_files(tmp_path / "empty")
+
+
+def test_a_package_that_is_missing_is_named_before_anything_is_read(tmp_path, monkeypatch):
+    monkeypatch.setitem(sys.modules, "safetensors", None)
+    with pytest.raises(SpadwarpError, match="denoising needs safetensors: pip install"):
+        denoise_file(tmp_path / "none.npy", tmp_path / "out")
 
 
 def test_depths_below_zero_count_as_not_reported(tmp_path):

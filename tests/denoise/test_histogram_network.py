@@ -131,21 +131,21 @@ def test_of_two_returns_the_stronger_one_is_found():
 
 
 def test_scattered_light_is_delayed_and_spread():
-    plain = Noise(delay=(0.01, 0.01), spread=(1.0, 1.0))
-    rate = torch.zeros(6, 33, 33, 192)
+    plain = Noise(delay=(0.01, 0.01), spread=(1.0, 1.0), events=(1e9, 1e9))
+    rate, bins = torch.zeros(6, 33, 33, 192), torch.arange(192)
     rate[:, 16, 16, 60] = 1.0
-    found = synthetic_noise._scattered(rate, plain, torch.Generator().manual_seed(2))
-    bins = torch.arange(192)
+    found = synthetic_noise._scattered(rate, torch.ones(6), plain, torch.Generator().manual_seed(2))
     # Weights are normalised for where light arrives, not for where it comes from, which differs near borders.
-    assert torch.allclose(found.sum(dim=(1, 2, 3)), torch.ones(6), atol=0.04)
-    assert (found[..., :60] == 0).all()
-    mean = (found.sum(dim=(1, 2)) * bins).sum(dim=1) - 60
-    assert (mean > 0.02).all() and (mean < 0.01 * 192 * 6 * 1.7).all()
-    assert (found[:, 16, 16].sum(dim=1) < 1.0).all() and (found[:, 16, 20].sum(dim=1) > 0).all()
-    assert torch.allclose(found[:, 12], found[:, 20]) and torch.allclose(found[:, :, 12], found[:, :, 20])
-    # Seen farther away, light was scattered by larger angles, or earlier: its path is longer.
-    near, far = ((one * bins).sum(dim=1) / one.sum(dim=1) for one in (found[:, 16, 17], found[:, 16, 22]))
-    assert (near < far).all()
+    assert torch.allclose(found.sum(dim=(1, 2, 3)), torch.ones(6), atol=0.04) and (found[..., :60] == 0).all()
+    mean, light = (found.sum(dim=(1, 2)) * bins).sum(dim=1) - 60, found.sum(dim=-1)
+    assert (mean > 0.02).all() and (mean < 0.01 * 192 * 1.7).all() and (light[:, 16, 16] < 1.0).all()
+    assert (light[:, 16, 20] > 0).all() and torch.allclose(light[:, 12], light[:, 20], atol=1e-4)
+    # Light scattered near the camera is seen far away and is early: no light beside is much later than the target's.
+    own, near, far = ((one * bins).sum(dim=1) / one.sum(dim=1) for one in (found[:, 16, x] for x in (16, 17, 19)))
+    assert torch.allclose(near, far, atol=0.1) and (near > own).all() and (near - own < 0.01 * 192 * 0.7).all()
+    few, photons = plain.model_copy(update={"events": (1.0, 1.0)}), torch.ones(99)
+    found = synthetic_noise._scattered(rate[:1].expand(99, -1, -1, -1), photons, few, torch.Generator().manual_seed(2))
+    assert (found[:, 16, 17:] > 0).float().mean() < 0.01 and abs(float(found.sum(dim=(1, 2, 3)).mean()) - 1.0) < 0.3
 
 
 def test_scattered_light_is_dimmer_and_later_than_a_target():

@@ -223,7 +223,7 @@ def test_crops_that_no_scene_holds_are_refused(tmp_path, size, wide, problem):
 
 @pytest.mark.slow
 def test_a_training_starts_from_the_weights_of_the_package(tmp_path):
-    noise = {"counting": 1.0, "scattered": 0.5, "roughness": [0.0, 1.0]}
+    noise = {"counting": 1.0, "scattered": 0.5, "events": [1.0, 10.0]}
     once = {**OPTIMISER, "steps": 2, "report_every": 2}
     done = train(
         tmp_path, scenes(count=1, size=32), model="histograms", start="histograms", noise=noise, optimiser=once

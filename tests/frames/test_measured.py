@@ -58,7 +58,9 @@ def files(tmp_path_factory):
     """The same histograms as files of every kind, beside some that lack a fact."""
     sparse = pytest.importorskip("scipy.sparse")
     folder, truth, flat = tmp_path_factory.mktemp("files"), np.ones((3, 5)), sparse.csc_array(FLAT)
-    for name, values in {"counts": COUNTS, "floats": 1.0 * COUNTS, "rates": 0.5 * COUNTS}.items():
+    arrays = {"counts": COUNTS, "floats": 1.0 * COUNTS, "rates": 0.5 * COUNTS, "none": 0 * COUNTS}
+    arrays |= {"pixels": COUNTS[0], "empty": COUNTS[:0], "nan": np.nan * COUNTS}
+    for name, values in arrays.items():
         np.save(folder / f"{name}.npy", values)
     np.save(folder / "tyx.npy", COUNTS.transpose(2, 0, 1))
     for name, values in {
@@ -124,7 +126,7 @@ WIDER = r"are .* a wider bin than 4 ps \(bin_width\) would help"
 @pytest.mark.parametrize(
     ("name", "options", "match"),
     [
-        ("tags.mat", {}, r"unit of the time tags in Ts is missing \(tag_unit\)"),
+        ("tags.mat", {}, r"missing \(tag_unit\).*=64ps,gate_start=0,group_index=.*irf="),
         ("tags.mat", {"tag_unit": 4e-12, "bin_width": 1e-11}, "bin width = 10 ps is not a multiple of the tags' unit"),
         ("far.mat", {"tag_unit": 4e-12}, rf"to {2**40} {WIDER}"),
         ("farther.mat", {"tag_unit": 4e-12}, rf"to {2**20 + 30} {WIDER}"),
@@ -134,17 +136,12 @@ WIDER = r"are .* a wider bin than 4 ps \(bin_width\) would help"
         ("two.h5", {"dataset": "big"}, r"no array 'big' \(dataset\); it holds a \(3, 5, 40\)"),
         ("counts.npy", {"axes": "xxt"}, "are not the letters of"),
         ("counts.npy", {"dataset": "hits"}, r"no array 'hits' \(dataset\); it holds one without name \(3, 5, 40\)"),
-        (
-            "counts.npy",
-            {"tag_unit": 4e-12, "image_size": (3, 5)},
-            "image_size and tag_unit cannot .*; it takes axes",
-        ),
+        ("counts.npy", {"tag_unit": 4e-12, "image_size": (3, 5)}, "image_size and tag_unit cannot .*; it takes axes"),
         ("flat.mat", {"image_size": (3, 5), "axes": "yxt"}, "axes cannot be given; it takes dataset, image_size"),
-        (
-            "counts.npy",
-            {"bin_width": 5e-11, "irf": instrument_response(jitter_fwhm=300.0, pulse_fwhm=0)},
-            "irf = 300 s",
-        ),
+        ("counts.npy", {"bin_width": 5e-11, "irf": instrument_response(jitter_fwhm=300.0, pulse_fwhm=0)}, "= 300 s"),
+        ("pixels.npy", {}, r"reshape \[pixels, T\] to \[H, W, T\]"),
+        ("empty.npy", {}, r"uint16 \(0, 5, 40\); real numbers .*, one or more"),
+        ("nan.npy", {}, "holds NaN, .*as_depth"),
     ],
 )
 def test_facts_that_are_missing_or_wrong_are_asked_for(files, name, options, match):
@@ -180,6 +177,13 @@ def test_a_background_that_does_not_explain_the_counts_is_warned_of(background):
 def test_what_is_assumed_is_said(files):
     with pytest.warns(SpadwarpWarning, match=r"gate start is not given \(gate_start\): bin 0 is taken"):
         assert read_histograms(files / "counts.npy").gate_start == 0
+    with pytest.warns(SpadwarpWarning, match="holds no counts"):
+        read_histograms(files / "none.npy", **START)
+    short = instrument_response(jitter_fwhm=300e-12, pulse_fwhm=0)
+    with pytest.warns(SpadwarpWarning, match=r"irf = 300 ps is 0.003 of bin_width = 1e\+05 ps; one of the two may"):
+        read_histograms(files / "counts.npy", irf=short, bin_width=1e-7, **START)
+    (text,) = read_histograms(files / "counts.npy", axes="tyx", **START).notes
+    assert text.startswith("axes: 40 x 5 pixels, 3 bins (axes = tyx); yxt would be usual")
     for name, kind, word in (("floats", "i", "counts: "), ("rates", "f", "rates: ")):  # counts if all are whole
         found = read_histograms(files / f"{name}.npy", **START)
         assert found.values.dtype.kind == kind and any(note.startswith(word) for note in found.notes)

@@ -282,10 +282,11 @@ def test_methods_differ_in_colour_and_marker():
 
 
 def test_colours_of_a_depth_frame_are_those_of_the_pixels_with_counts():
-    # One count in each pixel beside the target, anywhere in the gate; 200 in each pixel of the target.
-    depth = np.linspace(1.0, 9.0, 400).reshape(20, 20)
+    # One count in each pixel beside the target, anywhere in the gate; 1000 in each pixel of the target.
+    depth = np.linspace(1.0, 9.0, 1600).reshape(40, 40)
     counts = np.ones_like(depth)
-    depth[5:15, 5:15], counts[5:15, 5:15] = np.linspace(4.0, 4.1, 100).reshape(10, 10), 200.0
+    depth[10:30, 10:30], counts[10:30, 10:30] = np.linspace(4.0, 4.1, 400).reshape(20, 20), 1000.0
+    depth[20, 20], counts[20, 20] = 8.0, 1e5  # a hot pixel
     low, high = shown_limits(depth, beyond=1.0, weights=counts)
     assert 3.9 < low < 4.02 and 4.08 < high < 4.2
     assert shown_limits(depth, beyond=1.0, weights=0 * counts) == shown_limits(depth, beyond=1.0)
