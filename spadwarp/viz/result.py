@@ -176,11 +176,15 @@ def _hatched(pixels: NDArray[np.bool_]) -> str:
 def _typical_pixels(
     light: NDArray[Any], depth: NDArray[Any] | None, pixel: tuple[int, int] | None
 ) -> dict[str, tuple[int, int]]:
-    """The pixels with the median light of the target and of the water, of those there are, and the one asked for."""
-    target = np.zeros(light.shape, bool) if depth is None else np.isfinite(depth)
-    groups = {"Typical pixel of the target": target & (light > 0), "Typical pixel of the water": ~target & (light > 0)}
-    if depth is None:
-        groups = {"Typical pixel": light > 0}
+    """Pixels with typical light of the target, off its edges, and of the water, and the one asked for."""
+    groups = {"Typical pixel": light > 0}
+    if depth is not None:
+        from scipy.ndimage import maximum_filter, minimum_filter
+
+        target, known = np.isfinite(depth) & (light > 0), np.nan_to_num(depth, nan=1e9)
+        step = maximum_filter(known, 3) - minimum_filter(known, 3)
+        off_edges = target & (step <= np.median(step[target]) if target.any() else target)
+        groups = {"Typical pixel of the target": off_edges, "Typical pixel of the water": np.isnan(depth) & (light > 0)}
     found = {name: style.median_pixel(light, group) for name, group in groups.items() if group.any()}
     if pixel is not None:
         for index, name, length in zip(pixel, ("row", "column"), light.shape, strict=True):

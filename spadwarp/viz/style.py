@@ -35,6 +35,7 @@ STYLE = "spadwarp.viz.paper"
 COLUMN, PAGE = 3.5, 7.2
 """Widths of figures [inch]: one column of a journal (89 mm), the page (183 mm)."""
 
+MOST_HATCHED = 0.9  # part of the pixels from which on hatching would hide the image: words alone say what they are
 MISSING = "0.85"  # light grey: pixels without a value
 BACKGROUND = "#eef1f3"  # around targets
 TEXT = "0.25"
@@ -311,9 +312,6 @@ def mark_pixels(axis: Axes, missed: NDArray[np.bool_], invented: NDArray[np.bool
     marks = np.zeros((*missed.shape, 4))
     marks[missed], marks[invented] = to_rgba("black"), to_rgba(RED)
     axis.imshow(marks)
-
-
-MOST_HATCHED = 0.9  # part of the pixels from which on hatching would hide the image: words alone say what they are
 
 
 def hatch(axis: Axes, pixels: NDArray[np.bool_]) -> None:
