@@ -51,7 +51,7 @@ if TYPE_CHECKING:
     from spadwarp.denoise.training import Trained
 
 
-ENDINGS = (".h5", ".hdf5", ".exr", ".npy", ".mat", ".ptu")
+ENDINGS = (".h5", ".hdf5", ".exr", ".npy", ".npz", ".mat", ".ptu")
 
 _JUDGED = 1 << 19  # pixels, of which is told whether a denoiser makes them worse
 _EXR_CHANNELS = ("Z", "depth", "range", "A", "Depth.Z", "Depth.V")
@@ -86,13 +86,13 @@ def read_depth(
     """Depth from a file.
 
     `.h5`: a result or frames of counts; of an analytic file, a shard or a dataset's folder the depth as it is. `.exr`:
-    depth in `channel`. `.npy`, `.mat`, `.h5` of others: one frame `[H, W]` of depth, or histograms, see
+    depth in `channel`. `.npy`, `.npz`, `.mat`, `.h5` of others: one frame `[H, W]` of depth, or histograms, see
     `spadwarp.frames.read_histograms`. `.ptu`: histograms. Histograms become depth by `spadwarp.frames.depth.depth_of`,
     in every pixel.
 
     Args:
         path: The file.
-        as_depth: Three dimensions in `.npy`, `.mat` and `.h5` are frames `[N, H, W]` of depth, not a histogram.
+        as_depth: Three dimensions in `.npy`, `.npz`, `.mat` and `.h5` are frames `[N, H, W]` of depth, not a histogram.
         channel: Of an EXR; default: the first of Z, depth, range, A that it has. Of a result of polarised light: "I",
             "co" or "cross", see `spadwarp.result.analyser_channel`; default: "I", all light.
         scale: Metres per unit of stored depth; 0.01 for engines that write centimetres.
@@ -146,6 +146,8 @@ def read_depth(
         return DepthReading(depth=frames, frames=depth.ndim == 3, gate=None, profile=None, source=source)
     histograms = _read_histograms(place, measured | of_result)
     counted = histograms.values.dtype.kind in "iu" and histograms.response is not None
+    if counted and histograms.bin_width is None:
+        raise ArgumentError(f"{place}: bin width is missing (bin_width)")
     if counted:
         histograms = _with_background(histograms, background)
     elif background is not None:

@@ -450,7 +450,7 @@ WRONG = [
     ({"vary": {"medium.albedo": [0.1, -1.0]}}, r"vary: medium\.albedo = -1\.0"),
     ({"vary": {"medium.albedo": {"low": 0.1, "high": 1e7}}}, r"vary: medium\.albedo = 10000000\.0"),
     ({"vary": {"medium.albedo": {"low": 5e-324, "high": 1.0, "log": True}}}, "too far apart"),
-    ({"vary": {"laser.preset": ["lu2024", "none"]}}, r"vary: laser\.preset = 'none'"),
+    ({"vary": {"laser.preset": ["lu2024", "lu2042"]}}, r"vary: laser\.preset = 'lu2042'"),
     ({"vary": {"x": 3}}, "vary: x is not a known section"),
     ({"vary": {"medium.haze": 3}}, r"vary: medium\.haze is not a known field"),
     ({"plume": {**PLUME, "shape": ["fog"]}}, r"plume\.shape"),

@@ -116,6 +116,8 @@ def test_a_file_may_have_its_background_given(tmp_path):
     assert not read_depth(tmp_path / "counts.npy", background="none", **options).histograms.background.any()
     with pytest.raises(ArgumentError, match=r"background has shape \(5,\)"):
         read_depth(tmp_path / "counts.npy", background=np.ones(5), **options)
+    with pytest.raises(ArgumentError, match=r"counts.npy: bin width is missing \(bin_width\)"):
+        read_depth(tmp_path / "counts.npy", gate_start=0.0, irf=options["irf"])
     with pytest.raises(ArgumentError, match="background is of counts"), warnings.catch_warnings():
         warnings.simplefilter("ignore")
         read_depth(tmp_path / "counts.npy", background="flat", **facts)

@@ -38,11 +38,13 @@ def test_files_of_every_kind(tmp_path):
     path, out = saved(tmp_path, noisy)
     write_exr(tmp_path / "engine.exr", {"A": np.ascontiguousarray(100.0 * noisy)})
     savemat(tmp_path / "matlab.mat", {"depth": noisy, "name": "a text", "scalar": 3.0})
+    np.savez(tmp_path / "numbers.npz", depth=noisy)
     common = ["--model", "median", "--gate", "13.5:16", "--out", out]
     run("denoise", tmp_path / "engine.exr", "--input", "scale=0.01", *common)
     run("denoise", tmp_path / "matlab.mat", *common, "--overwrite")
+    run("denoise", tmp_path / "numbers.npz", *common, "--overwrite")
     run("denoise", path, "--json", tmp_path / "one.json", *common, "--overwrite")
-    for name in ("engine", "matlab"):
+    for name in ("engine", "matlab", "numbers"):
         assert np.nanmax(np.abs(np.load(out / f"{name}.npy") - np.load(out / "one.npy"))) < 1e-4
     assert (out / "one.png").stat().st_size > 10_000
     assert json.loads((tmp_path / "one.json").read_text())["files"][0]["gate"] == [13.5, 16.0]
