@@ -87,7 +87,7 @@ def draw_sweep(curves: Sweep, path: str | Path | None = None, *, width: float = 
             hollow = np.where(moved[own], shown, np.nan)
             axis.plot(place, hollow, "o", color=style_of["color"], markerfacecolor="white", markevery=every, zorder=3)
             for mark, cases in (("x", np.isinf(y[own])), ("$?$", unjudged[own])):
-                some, top, high = place[cases][::every], axis.get_xaxis_transform(), 0.97 - 0.06 * number
+                some, top, high = place[cases][::every], axis.get_xaxis_transform(), 0.97 - 0.04 * number
                 axis.scatter(some, np.full(len(some), high), 25.0, style_of["color"], marker=mark, transform=top)
         if name == "sigma_depth" and curves.fields == ("range", "water"):
             asked = f"depth error of {100 * TOLERANCE:g} cm"

@@ -176,11 +176,15 @@ def _hatched(pixels: NDArray[np.bool_]) -> str:
 def _typical_pixels(
     light: NDArray[Any], depth: NDArray[Any] | None, pixel: tuple[int, int] | None
 ) -> dict[str, tuple[int, int]]:
-    """The pixels with the median light of the target and of the water, of those there are, and the one asked for."""
-    target = np.zeros(light.shape, bool) if depth is None else np.isfinite(depth)
-    groups = {"Typical pixel of the target": target & (light > 0), "Typical pixel of the water": ~target & (light > 0)}
-    if depth is None:
-        groups = {"Typical pixel": light > 0}
+    """Pixels with typical light of the target, off its edges, and of the water, and the one asked for."""
+    groups = {"Typical pixel": light > 0}
+    if depth is not None:
+        from scipy.ndimage import maximum_filter, minimum_filter
+
+        target, known = np.isfinite(depth) & (light > 0), np.nan_to_num(depth, nan=1e9)
+        step = maximum_filter(known, 3) - minimum_filter(known, 3)
+        off_edges = target & (step <= np.median(step[target]) if target.any() else target)
+        groups = {"Typical pixel of the target": off_edges, "Typical pixel of the water": np.isnan(depth) & (light > 0)}
     found = {name: style.median_pixel(light, group) for name, group in groups.items() if group.any()}
     if pixel is not None:
         for index, name, length in zip(pixel, ("row", "column"), light.shape, strict=True):
@@ -246,10 +250,9 @@ def _result_figure(
 
 
 def _histogram_figure(result: Result, width: float, pixel: tuple[int, int] | None) -> Figure:
-    # By ballistic light on the target: in a short run a rare photon of large weight can make any pixel bright.
-    ballistic = result.expected("ballistic").sum(axis=2)
-    on_target = np.isfinite(result.truth.depth) & bool(ballistic.any())
-    pixels = _typical_pixels(np.where(on_target, ballistic, result.intensity), result.truth.depth, pixel)
+    light = sum(result.expected(name).sum(axis=2) for name in ("ballistic", "forward_scattered"))
+    on_target = np.isfinite(result.truth.depth) & bool(light.any())
+    pixels = _typical_pixels(np.where(on_target, light, result.intensity), result.truth.depth, pixel)
     unclear = unclear_pixels(result)
     figure = style.new_figure(width, 2.3 * max(len(pixels), 1))
     figure.caption(_caption(result))
@@ -522,7 +525,8 @@ def _frame_figure(
             raise ArgumentError(f"frame = {number} is outside [0, {1 if frames.summed else frames.frames})")
     counts = np.asarray(shown.counts if shown.summed else shown.counts[index])
     intensity = counts.sum(axis=-1)
-    light = np.asarray(shown.expected).sum(axis=-1)  # the brightest may have one photon of a large weight
+    on_target = np.isfinite(file.truth_depth) if file is not None else np.zeros(intensity.shape, bool)
+    light = (np.asarray(shown.expected) - np.asarray(shown.background) * on_target[..., None]).sum(axis=-1)
     pixels = _typical_pixels(light if light.any() else intensity, None if file is None else file.truth_depth, pixel)
     panels = Panels(intensity.shape, 2 if file is None else 4, width=width, below=(1.7,) * len(pixels))
     hatched = ""

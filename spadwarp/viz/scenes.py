@@ -75,9 +75,8 @@ def draw_slice(axis: Axes, scene: Scene, mesh: TriangleMesh | None, across: int)
             point, ray = start, (along + sign * slope * side) / np.linalg.norm(along + sign * slope * side)
             if port is not None:
                 point, ray, *_ = port.enter(start, ray)
-            # To the far end of the picture, or backwards.
-            far = point + ray * ((depth - point[2]) / ray[2] if ray[2] > 1e-6 else depth)
-            ends = np.array([start, point, far])
+            reach = (depth - point[2]) / ray[2] if ray[2] > 1e-6 else depth  # to the far end, or backwards
+            ends = np.array([start, point, point + reach * ray])
             axis.plot(ends[:, 2], ends[:, across], line, color=colour, lw=0.8, label=label if sign > 0.0 else None)
     if mesh is not None:
         for ends in _section(mesh, 1 - across):

@@ -124,6 +124,17 @@ def test_view_and_beam_behind_a_port_are_the_refracted_ones():
     assert lines["camera"].tolist() == [[0.0, 0.0]] and lines["laser"][0, 1] == behind.laser.position[0]
 
 
+def test_both_pictures_of_a_run_show_the_same_typical_pixel(tmp_path):
+    wide = scene().with_overrides(camera={"width": 16, "height": 16})
+    run_of = spadwarp.simulate(wide, photons=20_000, seed=1, device="cpu")
+    frames = spadwarp.frames.record_frames(run_of, tmp_path / "frames.h5", pulses=100, seed=1, device="cpu").file
+    titles = [
+        {axis.get_title().partition("\n")[0] for axis in figure.axes if axis.get_title().startswith("Typical")}
+        for figure in (run_of.plot("histogram"), frames.plot())
+    ]
+    assert titles[0] == titles[1] != set()
+
+
 def test_check_draws_the_cells(tmp_path):
     (tmp_path / "scene.toml").write_text(scene(medium={"grid": CLOUD}).to_toml())
     text = run("check", tmp_path / "scene.toml", "--picture", tmp_path / "water.png")
