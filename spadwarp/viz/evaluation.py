@@ -40,10 +40,14 @@ TITLES = {method: title for method, (title, *_) in METHODS.items()}
 """Names of methods in tables and figures."""
 
 SCORES = {
-    "psnr": ("PSNR [dB]", "{:.2f}"), "ssim": ("SSIM", "{:.3f}"), "entropy": ("entropy [bit]", "{:.2f}"),
-    "rmse_mm": ("RMSE [mm]", "{:.1f}"), "within_1cm": ("within 1 cm", "{:.1%}"),
-    "within_5cm": ("within 5 cm", "{:.1%}"), "edge_mm": ("edge error [mm]", "{:.1f}"),
-}  # fmt: skip
+    "psnr": ("PSNR [dB]", "{:.2f}"),
+    "ssim": ("SSIM", "{:.3f}"),
+    "entropy": ("entropy [bit]", "{:.2f}"),
+    "rmse_mm": ("RMSE [mm]", "{:.1f}"),
+    "within_1cm": ("within 1 cm", "{:.1%}"),
+    "within_5cm": ("within 5 cm", "{:.1%}"),
+    "edge_mm": ("edge error [mm]", "{:.1f}"),
+}
 """Title and format of each score."""
 
 _MARKS = _NO_TARGET, _MISSED, _INVENTED = "grey: no target", "black: target missed", "red: target invented"

@@ -128,7 +128,7 @@ LINES = {
     "scene": (3700, 5230),
     "transport": (2300, 3410),
     "validate": (750, 794),
-    "viz": (2200, 2555),
+    "viz": (2200, 2559),
     "water": (800, 852),
     "kernels/spadwarp_kernels": (50, 50),
     "kernels/analytic": (1650, 1676),
