@@ -57,7 +57,7 @@ def scene() -> str:
     parts = [
         MADE + "# Scene file\n\n"
         "A scene is a TOML file of sections. Units are SI where the name carries none; a text with a unit is "
-        'converted, such as `pulse_energy = "150 nJ"` ([units](../planning.md#units)). The camera looks along +z, with '
+        'converted, such as `pulse_energy = "150 nJ"` ([units](../commands.md#units)). The camera looks along +z, with '
         "+x right and +y down, from the origin unless it has a pose ([frames](../optics.md#frames)). A field that a "
         "file leaves out has its default, or the value of the section's `preset`; `--set SECTION.FIELD=VALUE` lies "
         "over both. What is not valid is refused with the field, its value and its range; `spadwarp check FILE` does "
