@@ -37,7 +37,7 @@ SMALLER = {
     r"spadwarp dataset \S+": "spadwarp dataset small --set scenes_per_target=1 --set frames.per_scene=2",
     r"dataset small --set": "dataset small --set scenes_per_shard=1 --set",
     r"train (out/\S+)": r"train \1 --set optimiser.steps=2",
-    r"^spadwarp evaluate ": "spadwarp evaluate --frames 1 ",
+    r"^spadwarp evaluate data": "spadwarp evaluate --frames 1 data",
     r"--device cuda:\w+": "--device cpu",
 }
 

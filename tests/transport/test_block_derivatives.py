@@ -38,7 +38,7 @@ def simulated(one, device, blocks):
 @pytest.mark.parametrize(("estimator", "tracking"), [("analog", "regular"), ("guided", "regular")])
 def test_blocks_share_the_derivatives_of_one_water(estimator, tracking, everywhere, device):
     """The same photons; with the derivatives of a target beside them."""
-    transport = {"estimator": estimator}
+    transport = {"estimator": estimator, "points_per_flight": 1}  # what derivatives by block have
     water = scene(medium={"layers": ELSEWHERE}, transport=transport)
     whole = simulate(water, photons=20_000, device=device, derivatives=WATER)
     one = scene(medium={"grid": {**everywhere, "tracking": tracking}}, transport=transport)
