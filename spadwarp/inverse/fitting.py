@@ -399,6 +399,7 @@ class Fitter:
             expected,
             self.law.variance(expected, trials),
             batches,
+            trials,
             self._lost(state, halves, solution, trials),
             parts,
         )

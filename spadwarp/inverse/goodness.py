@@ -113,13 +113,20 @@ class Lost(NamedTuple):
 
 
 def goodness_of(
-    counts: NDArray[np.integer], mean: Rows, variance: Rows, batches: Sequence[Rows], lost: Lost, parts: Sequence[Rows]
+    counts: NDArray[np.integer],
+    mean: Rows,
+    variance: Rows,
+    batches: Sequence[Rows],
+    trials: Rows,
+    lost: Lost,
+    parts: Sequence[Rows],
 ) -> Goodness:
     """Goodness of a fit from counts `[H, W, T]`.
 
     Args:
         counts, mean, variance: Of the fitted model, float32 `[pixel, bin]`.
         batches: The mean by each batch of photons of it.
+        trials: Pulses that can still count in each bin, of which the mean is a part.
         lost: To the fitted unknowns.
         parts: Of the mean, in the order of `COMPONENTS`.
     """
@@ -146,7 +153,7 @@ def goodness_of(
     found = {name: _Cells(add_up(rows), add_up(pieces[:number])) for name, (add_up, _) in ways.items()}
     deviances = {name: one.deviance(lost.of(one.mean, *ways[name])) for name, one in found.items()}
     if len(batches) > 1 and pieces[0].any():
-        deviances["width"] = _width(rows, pieces[:number], lost)
+        deviances["width"] = _width(rows, pieces[:number], trials, lost)
     cells = found["pixels and bins"]
     kinds = np.argmax(sums[number:], axis=0)
     excess, variances = (np.bincount(pixel, x) for x in (cells.each - cells.expected, cells.variance))
@@ -169,19 +176,21 @@ def goodness_of(
     )
 
 
-def _width(counts: NDArray[np.integer], pieces: Floats, lost: Lost) -> Deviance:
+def _width(counts: NDArray[np.integer], pieces: Floats, trials: Rows, lost: Lost) -> Deviance:
     """The square of the score of counts `[pixel, bin]` by the width of the response, in its variances: 1 in the mean.
 
-    A little more width adds the second difference of the mean over time. Taken from one half of the batches, it is
+    A little more width adds the second difference over time of the part of `trials` that is counted: that of the mean
+    itself would depend on the count of its own bin, which later trials lack. Taken from one half of the batches, it is
     independent of the noise of the other half; what it is weighted by is the mean of a cell.
     """
-    variance, batches = pieces[1], pieces[2:]
+    variance, batches, pulses = pieces[1], pieces[2:], np.maximum(trials, 1.0).astype(np.float64)
     first, _ = _cells(pieces[0])
     sizes = np.diff(first, append=counts.size)
     mean = np.maximum(np.repeat(np.add.reduceat(pieces[0].ravel(), first) / sizes, sizes), _LEAST).reshape(counts.shape)
     score = spread = 0.0
     for half, other in ((batches[::2], batches[1::2]), (batches[1::2], batches[::2])):
-        change = lost.beside(np.diff(np.pad(half.mean(axis=0), ((0, 0), (1, 1)), "edge"), 2, axis=1), mean) / mean
+        share = np.pad(half.mean(axis=0) / pulses, ((0, 0), (1, 1)), "edge")
+        change = lost.beside(pulses * np.diff(share, 2, axis=1), mean) / mean
         score += 0.5 * float((change * (counts - other.mean(axis=0))).sum())
         noise = np.einsum("bpt,pt->b", other, change).var(ddof=1) / len(other) if len(other) > 1 else 0.0
         # The counts are the same for both halves, the noise is not.
