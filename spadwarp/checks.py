@@ -272,7 +272,8 @@ def summary(scene: SceneLike, mesh: TriangleMesh | None = None) -> dict[str, Any
         **waters[0],
         "layers": [{"start": layer.start, **water} for layer, water in zip(medium.layers, waters[1:], strict=True)],
         "grid": _grid_summary(scene),
-        **{name: getattr(survey, name) for name in ("target_range", "target_arrival_ns")},
+        "target_range": survey.target_range,
+        "target_arrival_ns": survey.target_arrival_ns,
         **axis,
         "optical_depth": survey.optical_depth,
         "gate_range": (survey.range_of(gate.start), survey.range_of(gate.stop)),
@@ -280,7 +281,8 @@ def summary(scene: SceneLike, mesh: TriangleMesh | None = None) -> dict[str, Any
         "path_limit": scene.path_limit,
         "unambiguous_range": survey.range_of(1.0 / laser.repetition_rate),
         "irf_fwhm_ps": survey.irf_fwhm_ps,
-        **{f"{one}_fov_deg": math.degrees(getattr(camera, f"{one}_fov")) for one in ("horizontal", "vertical")},
+        "horizontal_fov_deg": math.degrees(camera.horizontal_fov),
+        "vertical_fov_deg": math.degrees(camera.vertical_fov),
         "aperture_area": camera.aperture_area,
         "focus_distance": survey.focus_distance,
         **{name: getattr(laser, name) for name in ("photons_per_pulse", "average_power", "peak_power")},
@@ -302,8 +304,8 @@ def implausible(scene: SceneLike) -> list[CheckMessage]:
     """Warnings that need no ray: values that are not plausible, with the unit that was probably meant, or not used."""
     scene, found = as_scene(scene), list[CheckMessage]()
     laser, detector, medium = scene.laser, scene.detector, scene.medium
-    aloft = ["horizontal_fov_deg", "half_angle_deg", "start_ns"]
-    del aloft[3 if scene.surface else int(scene.scan.mode == "trajectory") :]
+    moves = scene.scan.mode == "trajectory"
+    aloft = ("horizontal_fov_deg", "half_angle_deg", "start_ns")[: 3 if scene.surface else int(moves)]
     ports = {"camera.port": scene.camera.port, "laser.port": laser.port}
     ports = {name: port for name, port in ports.items() if isinstance(port, Port) and port.thickness > 0.0}
     for section, fields in _PLAUSIBLE.items():
@@ -423,7 +425,7 @@ def _check_target(survey: Survey, name: str, triangles: Points) -> None:
         widest = math.degrees(float(_angles(survey.visible(in_view), laser).max()))
         if math.tan(math.radians(min(widest, 89.9))) > 2.0 * math.tan(laser.half_angle):
             text = f"the beam misses most of what the camera sees of it: that reaches {widest:.3g}° off the axis, "
-            text += f"{_beam_text(scene.laser)}"
+            text += _beam_text(scene.laser)
             survey.note("laser.half_angle_deg", text, widest_angle_deg=widest)
     illuminated = survey.visible(illuminated)
     _check_gate(survey, name, survey.paths(illuminated))

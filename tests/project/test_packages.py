@@ -113,7 +113,7 @@ LINES = {
     "spadwarp": (750, 1445),
     "analytic": (2000, 2568),
     "benchmark": (500, 503),
-    "checks": (800, 897),
+    "checks": (800, 899),
     "cli": (2900, 3123),
     "dataset": (2600, 2675),
     "denoise": (4300, 4383),
