@@ -7,7 +7,7 @@ import operator
 import re
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from typing import Any, NamedTuple, TypeVar
+from typing import Any, Literal, NamedTuple, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -25,15 +25,16 @@ OVERFLOW = (
 
 NO_BATCHES = "the result has no errors: fewer than two batches of photons were kept; simulate with more photons"
 
-GROUPS = ("derivative_tallies", "channel_tallies", "flux_tallies")
+GROUPS = ("signed_tallies", "flux_tallies")
 
 Number = TypeVar("Number", int, float)
 
 
 @dataclass(frozen=True, eq=False)
 class SignedTallies:
-    """Tallies of the derivatives of a histogram, or of channels."""
+    """Tallies of the derivatives of a histogram, or of channels: a run has one of the two groups at most."""
 
+    group: Literal["derivatives", "channels"]
     names: tuple[str, ...]  # of the P parameters, such as "medium.absorption", or channels, such as "cross"
     tallies: NDArray[np.int64]  # int64 `[P, 3, H, W, T]`, by component; derivative or channel = tally · unit / photons
     units: tuple[float, ...]
@@ -73,8 +74,8 @@ class Tallies:
     batch_moments: Mapping[str, int] = field(default_factory=dict)
     """By component, over batches of its tally summed over voxels: `…_squares` (their sum, as that of `second_moment`),
     and over batches of `batch_size` photons `…_smallest` and `…_largest`; empty without batches."""
-    derivative_tallies: SignedTallies | None = None  # of the derivatives that were asked for; None if there are none
-    channel_tallies: SignedTallies | None = None  # of the camera's channels but "I", the histogram; None: no others
+    signed_tallies: SignedTallies | None = None
+    """Of the derivatives that were asked for, or of the channels but "I", the histogram; None if there are none."""
     flux_tallies: FluxTallies | None = None  # of the scene's sections of flux; None if there are none
 
     @property
@@ -117,7 +118,7 @@ def _group_total(parts: Sequence[Any]) -> Any:
     if not found:
         return None
     first, of_flux = found[0], isinstance(found[0], FluxTallies)
-    kinds = set() if of_flux else {(part.names, part.units) for part in found}
+    kinds = set() if of_flux else {(part.group, part.names, part.units) for part in found}
     if len(found) < len(parts) or len(kinds) > 1:
         raise ConfigError("the results have tallies of different derivatives, channels or flux")
     tallies, second_moment = _added_arrays(found)

@@ -78,7 +78,7 @@ class Spectrum:
             light += shares[wavelength] / max(whole, 1e-300) * (one.unit * one.photons) * one.tallies
         unit = min(one.unit for one in self.results.values())
         tallies: NDArray[np.int64] = np.rint(light / (unit * first.photons)).astype(np.int64)
-        none: dict[str, Any] = dict.fromkeys(("half", "second_moment", "reconstruction", "derivative_tallies"))
+        none: dict[str, Any] = dict.fromkeys(("half", "second_moment", "reconstruction", "signed_tallies"))
         return replace(
             first, scene=self.scene, tallies=tallies, unit=unit, batches=0, batch_size=0, batch_moments={}, **none
         )
@@ -214,7 +214,7 @@ def _simulate_together(lines: Sequence[Scene], **options: Any) -> list[Result]:
     cubes, kept = cubes_of(run, "channels"), slice(before, before + gate.bins)
     found = [*cubes.values()]
     found.insert(middle, Cube(run.tallies, run.unit, run.second_moment))
-    none: dict[str, Any] = dict.fromkeys(("half", "channel_tallies"))
+    none: dict[str, Any] = dict.fromkeys(("half", "signed_tallies"))
     return [
         replace(
             run,

@@ -261,7 +261,7 @@ class DeviceWorker:
             closed = self._closed or [_Closed(*sk.read_ledger(self.data), {}, batches=0, half_photons=0)]
             balances, counters, moments, batches, halves = zip(*closed, strict=True)
             balance = added(*balances)
-            signed, histogram, last = self._signed_tallies(), self._histograms[0], self._histograms[-1]
+            histogram, last = self._histograms[0], self._histograms[-1]
             flux = None if self.data.flux is None else last.total
             if self._spec.lines and not (self._spec.layered or self.model.lines.elastic[0]):
                 balance = self._with_shifted(balance)
@@ -274,8 +274,7 @@ class DeviceWorker:
                 half_photons=sum(halves),
                 half=None if histogram.half is None else _on_host(histogram.half).reshape(self._shape),
                 second_moment=histogram.second_moment(self._shape[1:]),
-                derivative_tallies=None if self._spec.channels else signed,
-                channel_tallies=signed if self._spec.channels else None,
+                signed_tallies=self._signed_tallies(),
                 flux_tallies=None if flux is None else FluxTallies(_on_host(flux), last.second_moment(flux.shape)),
             )
 
@@ -286,7 +285,8 @@ class DeviceWorker:
         histogram, shape = self._histograms[1], (*self._shape, len(self._signed))
         values, moments = histogram.total.numpy().reshape(shape), histogram.second_moment(shape[1:])
         moments = None if moments is None else np.ascontiguousarray(np.moveaxis(moments, -1, 1))
-        return SignedTallies(self._signed, np.moveaxis(values, -1, 0), self.signed_units, moments)
+        group: Any = "channels" if self._spec.channels else "derivatives"
+        return SignedTallies(group, self._signed, np.moveaxis(values, -1, 0), self.signed_units, moments)
 
     def _with_shifted(self, energy_balance: dict[str, int]) -> dict[str, int]:
         """Of what the water has absorbed, the part that is scattered inelastically in entries of its own: at every
