@@ -7,6 +7,7 @@ from typing import Any, Literal, NamedTuple
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+import spadwarp_kernels as sk
 from spadwarp.arrays import real_array
 from spadwarp.device import pick_device
 from spadwarp.frames.response import InstrumentResponse, detector_response
@@ -78,8 +79,6 @@ def information_from_histogram(
     """
     import warp as wp
 
-    from spadwarp_kernels import analytic as kernels
-
     signal = np.ascontiguousarray(real_array("signal_cube", signal_cube, within="[0, inf)"))
     if signal.size == 0:
         raise ArgumentError(f"signal_cube has shape {signal.shape}: no values")
@@ -101,7 +100,7 @@ def information_from_histogram(
     rows = np.ascontiguousarray(background.reshape(-1, bins) if background.ndim else background.reshape(1, 1))
     inputs: list[Any] = [wp.array(cube, dtype=wp.float32, device=device) for cube in (signal.reshape(-1, bins), rows)]
     inputs += [wp.array(weights, dtype=wp.float64, device=device) for weights in (taps, slope_taps)]
-    information = kernels.histogram_information(*inputs, first_photon=law == "first_photon").numpy()
+    information = sk.analytic.histogram_information(*inputs, first_photon=law == "first_photon").numpy()
     noise = np.zeros_like(information)
     total = np.asarray(signal + background, np.float64).reshape(-1, bins)
     if signal_halves is not None:

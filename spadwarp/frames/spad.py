@@ -15,6 +15,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple, Self
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+import spadwarp_kernels as sk
 from spadwarp.arrays import (
     Variable,
     histogram_rows,
@@ -130,10 +131,8 @@ class Receiver:
         """
         import warp as wp
 
-        from spadwarp_kernels import detection as kernels
-
         seen = Window.of(detector, laser, window or (axis[0], shape[2]), axis[1], tdc_widths)
-        noise: Any = kernels.dark_count_rates(
+        noise: Any = sk.detection.dark_count_rates(
             shape[0] * shape[1],
             median=detector.dark_count_rate,
             spread=detector.dark_count_spread,
@@ -160,10 +159,8 @@ class Receiver:
 
     def light(self, rows: Any, noise: Any = None) -> Any:
         """Light and noise in the detector's bins before its effects, Warp float32 `[pixel, bin]`, of source rows."""
-        from spadwarp_kernels import detection as kernels
-
         options = {"width": np.diff(self.window.edges), "noise_rate": self.noise if noise is None else noise}
-        return kernels.expected_detections(rows, **self.matrix._asdict(), **options)
+        return sk.detection.expected_detections(rows, **self.matrix._asdict(), **options)
 
     def hazard(self, rows: Any) -> Any:
         """λ: expected detections per pulse and bin of a detector that is always ready, Warp float32 `[pixel, bin]`."""
@@ -174,19 +171,15 @@ class Receiver:
 
     def _add_crosstalk(self, rates: Any, neighbours: Any) -> None:
         """λ, or its slope, gains a part of the detections of the four neighbours, in place."""
-        from spadwarp_kernels import detection as kernels
-
         probability = self.detector.crosstalk_probability
-        kernels.add_crosstalk(rates, neighbours, image_width=self.image[1], probability=probability)
+        sk.detection.add_crosstalk(rates, neighbours, image_width=self.image[1], probability=probability)
 
     def detections(self, hazard: Any) -> Any:
         """Expected detections per pulse of λ with pile-up, Warp float32 of the same shape."""
-        from spadwarp_kernels import detection as kernels
-
         if self.detector.mode != "free_running":
-            return kernels.first_photon_probabilities(hazard)
+            return sk.detection.first_photon_probabilities(hazard)
         dead_time = self.detector.dead_time_ns * 1e-9
-        return kernels.free_running_probabilities(hazard, dead_time=dead_time, period=self.window.period)
+        return sk.detection.free_running_probabilities(hazard, dead_time=dead_time, period=self.window.period)
 
     def background(self, rows: Any) -> Any:
         """λ of what is not target, with its own crosstalk and afterpulses, Warp float32 `[pixel, bin]`, of source rows
@@ -252,13 +245,11 @@ def first_photon_probabilities(hazard: Any, *, device: Any = None) -> NDArray[np
     """
     import warp as wp
 
-    from spadwarp_kernels import detection as kernels
-
     with in_torch_order(hazard):
         rows, shape = histogram_rows(hazard, name="hazard", device=device)
         if rows.dtype not in (wp.float32, wp.float64):
             rows = wp.array(rows.numpy().astype(np.float64), device=rows.device)
-        law = kernels.first_photon_probabilities(rows)
+        law = sk.detection.first_photon_probabilities(rows)
         values: Any = tensor_of(law).double() if is_torch(hazard) else law.numpy().astype(np.float64)
     return values.reshape(shape)
 
@@ -273,8 +264,6 @@ def coates(counts: Any, *, pulses: int, device: Any = None) -> NDArray[np.float6
     """
     import warp as wp
 
-    from spadwarp_kernels import detection as kernels
-
     with in_torch_order(counts):
         rows, shape = histogram_rows(counts, name="counts", device=device)
         if rows.dtype not in (wp.int32, wp.int64):
@@ -287,7 +276,7 @@ def coates(counts: Any, *, pulses: int, device: Any = None) -> NDArray[np.float6
             raise ArgumentError(f"pulses = {pulses} is below the {most} counts of a histogram: more than one a pulse")
         if rows.dtype != wp.int32:
             rows = wp.array(values.astype(np.int32), dtype=wp.int32, device=rows.device)
-        corrected = kernels.coates(rows, pulses=pulses)
+        corrected = sk.detection.coates(rows, pulses=pulses)
         result: Any = tensor_of(corrected) if is_torch(counts) else corrected.numpy()
     return result.reshape(shape)
 
@@ -580,8 +569,6 @@ def _draw(
     """Counts, in the tensor `out` where there is one, and for tags the detections one by one."""
     import warp as wp
 
-    from spadwarp_kernels import detection as kernels
-
     detector, window = receiver.detector, receiver.window
     by_event = detector.mode == "free_running" or tags or detector.afterpulsing_probability > 0
     add_frames = by_event and summed  # the kernel of events does not
@@ -590,7 +577,7 @@ def _draw(
     common: dict[str, Any] = {**numbers, "counter_depth": detector.max_count, "counts": given}
     found = None
     if by_event:
-        counts, events = kernels.event_counts(
+        counts, events = sk.detection.event_counts(
             hazard,
             edges=window.edges,
             recorded=window.recorded,
@@ -607,7 +594,7 @@ def _draw(
             y, x = np.divmod(pixel, receiver.image[1])
             found = TimeTags(frame + numbers["first_frame"], y, x, events["pulse"], events["bin"])
     else:
-        counts = kernels.first_photon_counts(hazard, summed=summed, **common)
+        counts = sk.detection.first_photon_counts(hazard, summed=summed, **common)
     if in_place:
         return out, found
     every: Any = counts.numpy() if out is None else tensor_of(counts)
