@@ -25,7 +25,7 @@ from spadwarp.scene.port import PortGeometry
 from spadwarp.scene.pose import rotation_matrix, sideways, vector_of
 from spadwarp.scene.scan import Shots, shots_of
 from spadwarp.scene.scene import camera_port, laser_port, mean_plane
-from spadwarp.scene.sight import lines_of_sight, scan_axes, view_directions, within_port
+from spadwarp.scene.sight import lines_of_sight, scan_axes, within_port
 from spadwarp.transport.derivatives import derivative_kinds, make_derivatives
 from spadwarp.transport.plan import tally_limits
 from spadwarp.values import ArgumentError, ConfigError, DeviceError
@@ -671,56 +671,46 @@ def truth_maps(scene: SceneLike, *, device: str | None = None) -> Truth:
 
 def trace_truth(scene: Scene, model: sk.Model) -> Truth:
     """`truth_maps` for a model that is already on its device."""
-    camera = scene.camera
-    shape = (camera.height, camera.width)
+    shape = (scene.camera.height, scene.camera.width)
     if model.mesh is None:
         nothing = np.full(shape, np.nan, np.float32)
         return Truth(depth=nothing, range=nothing, normal=np.full((*shape, 3), np.nan, np.float32), reflectance=nothing)
-    if scene.surface is not None:
-        return _truth_by_sea(scene, model, shape)
-    if scene.scan.mode == "trajectory":  # in the frame of each pixel's shot
-        shots = _shots(scene)
-        _, ranges, normal, reflectance = trace_rays(model, *shots.lines(), shape)
-        normal = np.einsum("hwij,hwi->hwj", shots.rotation[shots.number], normal).astype(np.float32)
-        depth = (ranges * view_directions(scene)[..., 2]).astype(np.float32)
-        return Truth(depth=depth, range=ranges, normal=normal, reflectance=reflectance)
-    nowhere, lead = np.zeros((0, 0, 3)), 0.0  # type: tuple[Any, Any]
-    origins, directions = nowhere, nowhere if camera.is_plain else pixel_directions(camera)
-    if camera.port is not None:
-        lines = lines_of_sight(scene)
-        origins, directions, lead = lines.start, lines.direction, lines.lead
-    depth, ranges, normal, reflectance = trace_rays(model, origins, directions, shape)
-    return Truth(depth=depth, range=(ranges + lead).astype(np.float32), normal=normal, reflectance=reflectance)
+    shots = _shots(scene) if scene.scan.mode == "trajectory" else None
 
-
-def _truth_by_sea(scene: Scene, model: sk.Model, shape: tuple[int, int]) -> Truth:
-    """Of what stands before the surface of the sea, and of what is seen through its waves, or its mean plane."""
-    (origin, view), (start, direction, lead) = _rays_by_sea(scene, model)
-    near, far = (trace_rays(model, *rays, shape) for rays in ((origin, view), (start, direction)))
-    if scene.scan.mode == "trajectory":  # in the frame of each pixel's shot
-        shots = _shots(scene)
-        turns, from_lens = shots.rotation[shots.number], start - origin
-        for found, begin, along in ((near, np.zeros(3), view), (far, from_lens, direction)):
-            depth = np.einsum("hwi,hwi->hw", turns[..., 2], begin + found[1][..., None] * along)
+    def trace(begin: Any, along: Any, from_lens: Any) -> list[Any]:
+        found = trace_rays(model, begin, along, shape)
+        if shots is not None:  # in the frame of each pixel's shot
+            turns = shots.rotation[shots.number]
+            depth = np.einsum("hwi,hwi->hw", turns[..., 2], from_lens + found[1][..., None] * along)
             normal = np.einsum("hwij,hwi->hwj", turns, found[2])
             found[0], found[2] = depth.astype(np.float32), normal.astype(np.float32)
-    far[1] = (far[1] + lead).astype(np.float32)
-    before = near[1] < np.nan_to_num(lead, nan=np.inf)
-    values = [np.where(before[..., None] if a.ndim == 3 else before, a, b) for a, b in zip(near, far, strict=True)]
+        return found
+
+    (origin, view), (start, direction, lead) = _rays(scene, model)
+    values = trace(start, direction, start - origin)
+    values[1] = (values[1] + lead).astype(np.float32)
+    if scene.surface is not None:  # what stands before the surface hides what is seen through it
+        near = trace(origin, view, np.zeros(3))
+        before = near[1] < np.nan_to_num(lead, nan=np.inf)
+        pairs = zip(near, values, strict=True)
+        values = [np.where(before[..., None] if a.ndim == 3 else before, a, b) for a, b in pairs]
     return Truth(**dict(zip(("depth", "range", "normal", "reflectance"), values, strict=True)))
 
 
-def _rays_by_sea(scene: Scene, model: sk.Model) -> tuple[tuple[Any, Any], tuple[Any, Any, Any]]:
-    """Rays of pixels `[H, W, 3]`: begin and direction at the lens; and where they meet the surface of the sea, how they
-    go on, and their lengths up to there."""
+def _rays(scene: Scene, model: sk.Model) -> tuple[tuple[Any, Any], tuple[Any, Any, Any]]:
+    """Rays of pixels `[H, W, 3]`: begin and direction at the lens; and where they leave its port, or meet the surface
+    of the sea, how they go on, and their lengths up to there. Empty: the camera's own, as `trace_rays` takes them."""
+    camera, plane = scene.camera, camera_port(scene)
     if scene.scan.mode == "trajectory":
         origin, view = _shots(scene).lines()
+    elif camera.is_plain and plane is None and scene.surface is None:
+        origin = view = np.zeros((0, 0, 3))
     else:
-        view = pixel_directions(scene.camera)
+        view = pixel_directions(camera)
         origin = np.zeros(view.shape)
     if scene.surface is None or scene.surface.waves is None:
-        plane = camera_port(scene) or mean_plane(scene, from_below=True)
-        return (origin, view), plane.enter(origin, view)[:3]
+        plane = mean_plane(scene, from_below=True) if plane is None and scene.surface is not None else plane
+        return (origin, view), (origin, view, 0.0) if plane is None else plane.enter(origin, view)[:3]
     rays: Any = [wp.array(a.astype(np.float32), dtype=wp.vec3, device=model.device) for a in (origin, view)]
     found: Any = [wp.empty_like(rays[0]), wp.empty_like(rays[0]), wp.empty(rays[0].shape, float, device=model.device)]
     wp.launch(sk.see_through_waves_kernel, rays[0].shape, [model.sea, *rays], found, device=model.device)
@@ -743,7 +733,7 @@ def wave_errors(scene: SceneLike, depth: ArrayLike | None = None, *, device: str
     if scene.surface is None or scene.surface.waves is None or plane is None:
         raise ConfigError("surface.waves, and a camera in the air above them, are needed", source=scene.source)
     model = build_model(scene, pick_device(device), build_mesh(scene), camera=False)
-    (origin, _), (start, direction, lead) = _rays_by_sea(scene, model)
+    (origin, _), (start, direction, lead) = _rays(scene, model)
     in_air = lead * plane.group_index[0] / plane.group_index[2]  # as a length in water
     lines = dataclasses.replace(lines_of_sight(scene), laser=np.zeros(3), laser_port=plane)
     if depth is None:
