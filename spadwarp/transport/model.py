@@ -87,10 +87,13 @@ def build_model(
         parts["derivatives"] = make_derivatives(scene, derivatives, mesh, scale, device, grid)
     if sea is not None:
         parts["sea"] = sea
+    scales = [scale] * len(scene.tallied_channels)
     if scene.polarised:
-        parts |= _polarised(scene, mesh, scale, device)
+        parts["polarisation"] = _polarisation(scene, mesh, device)
     if scene.medium.inelastic or scene.medium.beside:
-        parts |= _lines(scene, scale, device)
+        parts["lines"], scales = _lines(scene, scale, device)
+    if scales:
+        parts["derivatives"] = sk.make_derivatives([], [], scales, channels=len(scales), device=device)
     if camera and scene.flux:
         parts["flux"] = _flux(scene, device)
     model = sk.Model(
@@ -515,23 +518,19 @@ def _has_rotated_domain(scene: Scene) -> bool:
     return scene.domain.shape != "unbounded" and any(scene.camera.rotation_deg)
 
 
-def _polarised(scene: Scene, mesh: TriangleMesh | None, scale: float, device: wp.Device) -> dict[str, Any]:
-    """Polarised light of the model, and tallies of the camera's channels in the unit of its histogram."""
+def _polarisation(scene: Scene, mesh: TriangleMesh | None, device: wp.Device) -> Any:
+    """Polarised light of the model, and the camera's channels of it."""
     rows, facets = _channel_rows(scene.camera), ()  # type: tuple[Any, Any]
     if mesh is not None and mesh.specular is not None:
         index = np.array([target.specular_index for target in scene.targets]) / scene.medium.phase_index
         facets = index[mesh.target]
     emitted, matrix = _emitted_stokes(scene.laser), scattering_matrix(scene.medium)
-    light = sk.make_polarisation(laser=emitted, matrix=matrix, channels=rows, facet_index=facets, device=device)
-    if not rows:
-        return {"polarisation": light}
-    tallies = sk.make_derivatives([], [], [scale] * len(rows), channels=len(rows), device=device)
-    return {"polarisation": light, "derivatives": tallies}
+    return sk.make_polarisation(laser=emitted, matrix=matrix, channels=rows, facet_index=facets, device=device)
 
 
-def _lines(scene: Scene, scale: float, device: wp.Device) -> dict[str, Any]:
-    """Light of other wavelengths, and a tally of each. That of inelastic scattering is finer than the histogram by as
-    much as it holds less: at most as much as inelastic scattering is of elastic by any one angle."""
+def _lines(scene: Scene, scale: float, device: wp.Device) -> tuple[Any, list[float]]:
+    """Light of other wavelengths, and the scale of each tally. Of inelastic scattering it is finer than the histogram's
+    by as much as it holds less: at most as much as inelastic scattering is of elastic by any one angle."""
     water, wavelength = scene.medium, scene.laser.wavelength_nm
     if count := len(water.beside):
         # Of their molecules what their scattering by the medium's law has not; the law of both is that of the medium.
@@ -548,8 +547,7 @@ def _lines(scene: Scene, scale: float, device: wp.Device) -> dict[str, Any]:
             device=device,
             delay=[one.group_index / water.group_index for one in water.beside],
         )
-        tallies = sk.make_derivatives([], [], [scale] * count, channels=count, device=device)
-        return {"lines": found, "derivatives": tallies}
+        return found, [scale] * count
     lines, least = water.inelastic, float(phase_function(water).density(np.linspace(0.01, math.pi, 500)).min())
     rows = np.array([one.in_waters(water.waters, wavelength) for one in lines])  # [line, water, coefficient]
     source, extinction, scattering = np.moveaxis(rows, (0, 1, 2), (2, 1, 0))
@@ -559,8 +557,7 @@ def _lines(scene: Scene, scale: float, device: wp.Device) -> dict[str, Any]:
         source, [one.anisotropy for one in lines], extinction, scattering, passed, media=media, device=device
     )
     parts = passed * (source / [[one.scattering] for one in water.waters]).max(axis=0) / (4.0 * math.pi * least)
-    scales = [scale / 2.0 ** math.floor(math.log2(max(part, 1e-12))) for part in parts]
-    return {"lines": found, "derivatives": sk.make_derivatives([], [], scales, channels=len(lines), device=device)}
+    return found, [scale / 2.0 ** math.floor(math.log2(max(part, 1e-12))) for part in parts]
 
 
 def _emitted_stokes(laser: Laser) -> tuple[float, float, float, float]:

@@ -12,6 +12,7 @@ import weakref
 from collections import deque
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager, suppress
+from dataclasses import replace
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -29,7 +30,6 @@ from spadwarp.result.tallies import (
     IdQueue,
     Range,
     Ranges,
-    added,
     count,
     joined,
     joined_moments,
@@ -92,16 +92,6 @@ class _Histogram:
         return words
 
 
-class _Closed(NamedTuple):
-    """What closed batches left beside their arrays, as in `Tallies`."""
-
-    energy_balance: dict[str, int]
-    counters: dict[str, int]
-    batch_moments: dict[str, int]
-    batches: int
-    half_photons: int
-
-
 class DeviceWorker:
     """A device with a model and tallies of its own, or the caller's.
 
@@ -140,7 +130,7 @@ class DeviceWorker:
             # Compiles, or loads from Warp's cache, before the time of the launches is taken.
             self._most = min(launch_size, batch_size or launch_size)
             sk.load_transport_kernel(spec, model.device)
-        self._closed = list[_Closed]()
+        self._closed = list[Tallies]()  # what closed batches left beside their arrays
         self._unread = list[tuple[int, bool]]()  # batches closed on the device: photons, and whether in the half
         self._running = deque[tuple[int, wp.Event]]()  # launches on a GPU: photons, and their end
 
@@ -241,9 +231,15 @@ class DeviceWorker:
         unread, sums = self._unread, self._histograms[0].batches.take_sums()
         each = [moments_of(self._names, s, n, self._batch_size) for s, (n, _) in zip(sums, unread, strict=True)]
         half = sum(photons for photons, in_half in unread if in_half)
-        self._closed.append(_Closed(*sk.read_ledger(self.data), joined_moments(*each), len(unread), half))
+        read = self._counted(batches=len(unread), half_photons=half, batch_moments=joined_moments(*each))
+        self._closed.append(read)
         self.data.ledger.zero_()
         self._unread = []
+
+    def _counted(self, **of_batches: Any) -> Tallies:
+        """What stands in the ledger; without arrays."""
+        balance, counters = sk.read_ledger(self.data)
+        return Tallies(tallies=np.zeros(0, np.int64), energy_balance=balance, counters=counters, **of_batches)
 
     def take_over(self, other: DeviceWorker) -> None:
         """Moves the tallies of another worker of the same run here; both must rest."""
@@ -258,20 +254,15 @@ class DeviceWorker:
     def tallies(self) -> Tallies:
         """Those of all photons traced here, open batches aside; on the CPU in the memory of this worker."""
         with device_errors(self.model.device):
-            closed = self._closed or [_Closed(*sk.read_ledger(self.data), {}, batches=0, half_photons=0)]
-            balances, counters, moments, batches, halves = zip(*closed, strict=True)
-            balance = added(*balances)
-            histogram, last = self._histograms[0], self._histograms[-1]
+            counted = total_of(*(self._closed or [self._counted()]))
+            balance, histogram, last = dict(counted.energy_balance), self._histograms[0], self._histograms[-1]
             flux = None if self.data.flux is None else last.total
             if self._spec.lines and not (self._spec.layered or self.model.lines.elastic[0]):
                 balance = self._with_shifted(balance)
-            return Tallies(
+            return replace(
+                counted,
                 tallies=_on_host(histogram.total).reshape(self._shape),
                 energy_balance=balance,
-                counters=added(*counters),
-                batch_moments=joined_moments(*moments),
-                batches=sum(batches),
-                half_photons=sum(halves),
                 half=None if histogram.half is None else _on_host(histogram.half).reshape(self._shape),
                 second_moment=histogram.second_moment(self._shape[1:]),
                 signed_tallies=self._signed_tallies(),
@@ -451,15 +442,12 @@ class LocalWorkers:
         self._devices, self._stopped = devices, threading.Event()
         self._events: queue.SimpleQueue[Event] = queue.SimpleQueue()
         self._busy, self._failures = set[Worker](), list[BaseException]()
-        self.workers = [
-            Worker(device.alias, threads, self._stopped, {"tracer": tracer})
-            for device, tracer in zip(devices, self.tracers, strict=True)
-        ]
-        for worker in self.workers:
-            worker.state["report"] = functools.partial(self._report, worker)
-
-    def _report(self, worker: Worker, photons: int) -> None:
-        self._events.put(Event("progress", worker, photons))
+        self.workers = [Worker(device.alias, threads, self._stopped) for device in devices]
+        for worker, tracer in zip(self.workers, self.tracers, strict=True):
+            worker.state |= {
+                "tracer": tracer,
+                "report": lambda n, who=worker: self._events.put(Event("progress", who, n)),
+            }
 
     @property
     def idle(self) -> list[Worker]:
