@@ -11,6 +11,7 @@ import time
 import weakref
 from collections import deque
 from collections.abc import Callable, Iterator, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager, suppress
 from dataclasses import replace
 from typing import Any, NamedTuple
@@ -174,43 +175,27 @@ class DeviceWorker:
         self, ids: Range, launch: Callable[[int, int], None], stopped: threading.Event, report: Callable[[int], None]
     ) -> Ranges:
         """Traces the ids with all threads; on a GPU the last launch may still be under way."""
-        waiting, done, lock = IdQueue([ids]), list[Range](), threading.Lock()
-        failures: list[BaseException] = []
         device: Any = self.model.device
+        spans, waiting, parts = list[Range](), IdQueue([ids]), 2 * self._threads if self._threads > 1 else 1
+        # Fewer towards the end so that all threads end at about the same time.
+        while span := waiting.take(min(self._launch_size, max(waiting.left // parts, self._launch_size // 16, 1))):
+            spans.append(span)
 
-        def spans() -> Iterator[Range]:
-            while not (stopped.is_set() or failures):
-                with lock:
-                    # Fewer towards the end so that all threads end at about the same time.
-                    share = waiting.left // (2 * self._threads) if self._threads > 1 else waiting.left
-                    span = waiting.take(min(self._launch_size, max(share, self._launch_size // 16, 1)))
-                if span is None:
-                    return
-                yield span
+        def trace(span: Range) -> Ranges:
+            first, stop = span
+            if stopped.is_set():
+                return ()
+            launch(first, stop - first)
+            if device.is_cuda:
+                self._running.append((stop - first, device.stream.record_event()))
+                self._wait(report, ahead=1)
+            else:
+                report(stop - first)
+            return (span,)
 
-        def work() -> None:
-            try:
-                for first, stop in spans():
-                    launch(first, stop - first)
-                    with lock:
-                        done.append((first, stop))
-                    if device.is_cuda:
-                        self._running.append((stop - first, device.stream.record_event()))
-                        self._wait(report, ahead=1)
-                    else:
-                        report(stop - first)
-            except BaseException as error:
-                failures.append(error)
-
-        helpers = [threading.Thread(target=work, daemon=True) for _ in range(self._threads - 1)]
-        for thread in helpers:
-            thread.start()
-        work()
-        for thread in helpers:
-            thread.join()
-        if failures:
-            raise failures[0]
-        return joined(done)
+        with ThreadPoolExecutor(self._threads) as pool:  # what fails cancels what has not begun
+            done = list((pool.map if self._threads > 1 else map)(trace, spans))
+        return joined(itertools.chain(*done))
 
     def _close_batch(self, ids: Ranges) -> None:
         """Adds a batch of these photons to the totals."""
