@@ -9,6 +9,7 @@ from __future__ import annotations
 import math
 import os
 import warnings
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, NamedTuple, Self
 
@@ -164,15 +165,14 @@ class Receiver:
 
     def hazard(self, rows: Any) -> Any:
         """λ: expected detections per pulse and bin of a detector that is always ready, Warp float32 `[pixel, bin]`."""
-        hazard = self.light(rows)
-        if self.detector.crosstalk_probability > 0:
-            self._add_crosstalk(hazard, self.detections(hazard))
-        return hazard
+        return self._with_crosstalk(self.light(rows), self.detections)
 
-    def _add_crosstalk(self, rates: Any, neighbours: Any) -> None:
-        """λ, or its slope, gains a part of the detections of the four neighbours, in place."""
-        probability = self.detector.crosstalk_probability
-        sk.detection.add_crosstalk(rates, neighbours, image_width=self.image[1], probability=probability)
+    def _with_crosstalk(self, rates: Any, neighbours: Callable[[Any], Any]) -> Any:
+        """λ, or its slope, with a part of the detections of the four neighbours, which follow from it; in place."""
+        if (probability := self.detector.crosstalk_probability) > 0:
+            others = neighbours(rates)
+            sk.detection.add_crosstalk(rates, others, image_width=self.image[1], probability=probability)
+        return rates
 
     def detections(self, hazard: Any) -> Any:
         """Expected detections per pulse of λ with pile-up, Warp float32 of the same shape."""
@@ -214,25 +214,19 @@ class Receiver:
         return np.diff(turns - np.expm1(-time / delay) / whole, axis=1)
 
     def slope(self, rows: Any) -> Any:
-        """Derivative of λ by what changes the source by `rows` `[pixel, source bin]`, which may be negative."""
+        """Derivative of λ by what changes the source by `rows` `[pixel, source bin]`, which may be negative; with
+        crosstalk as if the pile-up of the neighbours stayed as it is."""
         import warp as wp
 
-        return self._followed(self.light(rows, wp.zeros(rows.shape[0], dtype=wp.float32, device=rows.device)))
+        none = wp.zeros(rows.shape[0], dtype=wp.float32, device=rows.device)
+        return self._with_crosstalk(self.light(rows, none), wp.clone)
 
     def noise_slope(self) -> Any:
-        """Derivative of λ by a noise rate [1/s] that all pixels share."""
+        """Derivative of λ by a noise rate [1/s] that all pixels share; crosstalk as in `slope`."""
         import warp as wp
 
         widths = np.tile(np.diff(self.window.edges).astype(np.float32), (self.image[0] * self.image[1], 1))
-        return self._followed(wp.array(widths, device=self.noise.device))
-
-    def _followed(self, slope: Any) -> Any:
-        """With crosstalk, as if the pile-up of the neighbours stayed as it is."""
-        import warp as wp
-
-        if self.detector.crosstalk_probability > 0:
-            self._add_crosstalk(slope, wp.clone(slope))
-        return slope
+        return self._with_crosstalk(wp.array(widths, device=self.noise.device), wp.clone)
 
 
 # Frames, and the law of their pile-up
