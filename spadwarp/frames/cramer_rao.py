@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 import spadwarp_kernels as sk
-from spadwarp.arrays import Floats, real_array
+from spadwarp.arrays import Floats, as_warp, real_array
 from spadwarp.device import pick_device
 from spadwarp.frames.response import InstrumentResponse, detector_response
 from spadwarp.result.file import ResultLike, as_result
@@ -75,8 +75,6 @@ def information_from_histogram(
 
     Raises `ArgumentError`: negative or non-finite cubes, shapes that do not fit, values out of range.
     """
-    import warp as wp
-
     signal = np.ascontiguousarray(real_array("signal_cube", signal_cube, within="[0, inf)"))
     if signal.size == 0:
         raise ArgumentError(f"signal_cube has shape {signal.shape}: no values")
@@ -96,8 +94,8 @@ def information_from_histogram(
         taps, slope_taps = irf.per_bin(bin_width), irf.per_bin_slope(bin_width)
     device = pick_device(device)
     rows = np.ascontiguousarray(background.reshape(-1, bins) if background.ndim else background.reshape(1, 1))
-    inputs: list[Any] = [wp.array(cube, dtype=wp.float32, device=device) for cube in (signal.reshape(-1, bins), rows)]
-    inputs += [wp.array(weights, dtype=wp.float64, device=device) for weights in (taps, slope_taps)]
+    given = {"signal": signal.reshape(-1, bins), "background": rows, "taps": taps, "slope_taps": slope_taps}
+    inputs = [as_warp(array, name=name, device=device) for name, array in given.items()]
     information = sk.analytic.histogram_information(*inputs, first_photon=law == "first_photon").numpy()
     noise = np.zeros_like(information)
     total = np.asarray(signal + background, np.float64).reshape(-1, bins)

@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 import spadwarp_kernels as sk
-from spadwarp.arrays import histogram_rows, in_torch_order, is_torch, on_host, real_array, tensor_of
+from spadwarp.arrays import as_warp, histogram_rows, in_torch_order, is_torch, on_host, real_array, tensor_of
 from spadwarp.frames.backgrounds import BackgroundLaw, estimate_background
 from spadwarp.frames.response import InstrumentResponse
 from spadwarp.result import Result
@@ -188,12 +188,10 @@ def _background_shape(rows: Any, frame: tuple[int, ...], first: int, stop: int, 
 
     One count more keeps it from 0.
     """
-    import warp as wp
-
     shape = np.ones((1, rows.shape[1]), np.float32)
     counts = rows.numpy()[:, first:stop].reshape(-1, *(1, *frame)[-2:], stop - first)
     shape[0, first:stop] = estimate_background(counts, fwhm).per_bin + 1.0 / len(rows)
-    return wp.array(shape, dtype=wp.float32, device=rows.device)
+    return as_warp(shape, name="background", device=rows.device)
 
 
 def _response_table(irf: InstrumentResponse, bin_width: float, phases: int) -> tuple[NDArray[np.float64], int]:

@@ -19,6 +19,7 @@ from numpy.typing import ArrayLike, NDArray
 import spadwarp_kernels as sk
 from spadwarp.arrays import (
     Variable,
+    as_warp,
     histogram_rows,
     in_torch_order,
     is_torch,
@@ -130,8 +131,6 @@ class Receiver:
 
         `device` is a Warp device; the others are arguments of `spadwarp.detect`. Raises `ArgumentError`.
         """
-        import warp as wp
-
         seen = Window.of(detector, laser, window or (axis[0], shape[2]), axis[1], tdc_widths)
         noise: Any = sk.detection.dark_count_rates(
             shape[0] * shape[1],
@@ -146,7 +145,7 @@ class Receiver:
         if ambient is not None:
             values = real_array("ambient", ambient, np.float64, shapes=((), shape[:2]), within="[0, inf)")
             rates = noise.numpy() + np.broadcast_to(values, shape[:2]).reshape(-1)
-            noise = wp.array(rates.astype(np.float32), dtype=wp.float32, device=noise.device)
+            noise = as_warp(rates.astype(np.float32), name="ambient", device=noise.device)
         matrix = response_matrix(
             detector_response(detector, laser) if irf is None else irf,
             source_start=axis[0],
@@ -184,21 +183,19 @@ class Receiver:
     def background(self, rows: Any) -> Any:
         """λ of what is not target, with its own crosstalk and afterpulses, Warp float32 `[pixel, bin]`, of source rows
         of backscatter or None; of dark counts and ambient light alone `[pixel, 1]` where all bins are alike."""
-        import warp as wp
-
         probability, device = self.detector.afterpulsing_probability, self.noise.device
         if rows is None:
             if not (probability or self.detector.crosstalk_probability):
                 widths = np.diff(self.window.edges[: 2 if self.equal_bins else self.window.recorded + 1])
-                return wp.array((self.noise.numpy()[:, None] * widths).astype(np.float32), device=device)
+                return as_warp((self.noise.numpy()[:, None] * widths).astype(np.float32), name="noise", device=device)
             shape = self.noise.size, int(self.matrix.source_bin.max(initial=0)) + 1
-            rows = wp.zeros(shape, dtype=float, device=device)
+            rows = as_warp(np.zeros(shape, np.float32), name="background", device=device)
         known = found = self.hazard(rows)
         if probability:
             share = (probability * self._afterpulse_share()).astype(np.float32)
             for _ in range(math.ceil(math.log(1e-4, probability))):  # afterpulses have afterpulses
                 more = self.detections(found).numpy() @ share
-                found = wp.array(known.numpy() + more, dtype=float, device=device)
+                found = as_warp(known.numpy() + more, name="background", device=device)
         return found
 
     def _afterpulse_share(self) -> NDArray[np.float64]:

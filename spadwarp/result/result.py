@@ -776,17 +776,17 @@ def _noise_ratios(result: Result, pixels: NDArray[np.intp]) -> Floats:
     tallies, moments = result.tallies.reshape(components, -1, bins), result.known_moment.reshape(2, -1, bins)
     size = max(1, _PART_VOXELS // bins)
     scene, value, better = result.scene, result.tally_value.reshape(-1), result.reconstruction
+    per_pulse = scene.laser.photons_per_pulse * scene.detections_per_photon
     target = np.isfinite(result.truth.depth).reshape(-1)
     noise = np.broadcast_to(noise_rate(scene, result.truth), (*result.truth.depth.shape, 1)).reshape(-1)
     ratios = np.full(len(pixels), np.nan)
     for first in range(0, len(pixels), size):
         part = pixels[first : first + size]
-        mine = tallies[:, part]
-        scale = (value[part] * (scene.laser.photons_per_pulse * scene.detections_per_photon))[:, None]
         if better is None:
+            mine, scale = tallies[:, part], (value[part] * per_pulse)[:, None]
             error = result.batch_error(mine, moments[:, part]) * scale
         else:
-            scale = np.full((1, 1), scene.laser.photons_per_pulse * scene.detections_per_photon)
+            scale = np.full((1, 1), per_pulse)
             mine = better.histogram.reshape(components, -1, bins)[:, part].astype(np.float64)
             error = better.error.reshape(-1, bins)[part] * scale
         light = mine.sum(axis=0) * scale
