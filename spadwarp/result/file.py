@@ -16,6 +16,7 @@ from spadwarp.io.arrays import read_exr, write_exr
 from spadwarp.io.hdf5 import Coordinate, Hdf5File, image_chunks, name_dimensions, read_hdf5, write_hdf5, write_packed
 from spadwarp.io.paths import file_within
 from spadwarp.io.text import read_toml
+from spadwarp.result.photon_ids import Range, joined
 from spadwarp.result.result import (
     ARRAYS,
     DIMENSION_OF,
@@ -31,11 +32,9 @@ from spadwarp.result.result import (
 )
 from spadwarp.result.tallies import (
     FluxTallies,
-    Range,
     SignedTallies,
     added,
     flux_arrays,
-    joined,
     moments_of,
     part_of,
     rebatched,

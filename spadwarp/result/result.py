@@ -15,17 +15,16 @@ from numpy.typing import NDArray
 from spadwarp.arrays import Floats
 from spadwarp.io.hdf5 import Coordinate, image_coordinates
 from spadwarp.io.text import read_toml
+from spadwarp.result.photon_ids import count, photons_per_position
 from spadwarp.result.tallies import (
     GRID,
     NO_BATCHES,
     Tallies,
     block_parameters,
     check_flux,
-    count,
     flux_arrays,
     is_block_name,
     part_of,
-    photons_per_position,
 )
 from spadwarp.scene import Scene, noise_rate
 from spadwarp.scene.medium import NOTABLE_UNSEEN

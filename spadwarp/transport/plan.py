@@ -16,8 +16,8 @@ import spadwarp_kernels as sk
 from spadwarp.mesh import TriangleMesh, build_mesh, focus_distance
 from spadwarp.result import Result, ResultLike
 from spadwarp.result.file import difference
+from spadwarp.result.photon_ids import count, shard_of
 from spadwarp.result.result import ResultHead
-from spadwarp.result.tallies import count, shard_of
 from spadwarp.scene import Laser, Scene, Transport
 from spadwarp.scene.camera import to_camera
 from spadwarp.scene.laser import load_profile, profile_extent

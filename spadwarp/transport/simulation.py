@@ -23,8 +23,9 @@ from spadwarp.device import pick_device, pick_devices, processor_name
 from spadwarp.parallel.workers import Event, Ray, interruptible
 from spadwarp.result import Result, as_result, merge, save_result
 from spadwarp.result.file import TARGETS_DIFFER, same_targets
+from spadwarp.result.photon_ids import IdQueue, Range, Ranges, count, joined, without
 from spadwarp.result.result import NOISE_GOAL, ResultHead, largest_share, unseen_warnings
-from spadwarp.result.tallies import IdQueue, Range, Ranges, check_capacity, count, joined, without
+from spadwarp.result.tallies import check_capacity
 from spadwarp.scene import SceneLike, as_scene
 from spadwarp.transport.model import points_per_flight
 from spadwarp.transport.plan import Plan, RunOptions, make_plan

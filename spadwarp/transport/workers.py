@@ -26,18 +26,8 @@ from spadwarp.device import core_count, kernel_thread, pick_device, pick_devices
 from spadwarp.mesh import TriangleMesh
 from spadwarp.parallel.workers import Event, Ray, RayWorkers, Worker
 from spadwarp.result import FluxTallies, SignedTallies, Tallies, Truth
-from spadwarp.result.tallies import (
-    OVERFLOW,
-    IdQueue,
-    Range,
-    Ranges,
-    count,
-    joined,
-    joined_moments,
-    moments_of,
-    photons_per_position,
-    total_of,
-)
+from spadwarp.result.photon_ids import IdQueue, Range, Ranges, count, joined, photons_per_position
+from spadwarp.result.tallies import OVERFLOW, joined_moments, moments_of, total_of
 from spadwarp.scene import Scene
 from spadwarp.transport.model import MeshCache, build_model, trace_truth, transport_spec
 from spadwarp.transport.plan import LARGEST_LAUNCH, LAUNCH_SIZE, Plan, RunOptions, make_plan
