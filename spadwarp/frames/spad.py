@@ -36,16 +36,7 @@ from spadwarp.result.analysis import UNKNOWN_NOISE, noise_problem, with_frames
 from spadwarp.result.file import as_result
 from spadwarp.result.result import Result, Truth
 from spadwarp.scene import Detector, Laser, detection_efficiency, noise_rate
-from spadwarp.values import (
-    BIN_WIDTH,
-    SEED,
-    TIME,
-    ArgumentError,
-    Shown,
-    SpadwarpWarning,
-    check_integer,
-    check_real,
-)
+from spadwarp.values import BIN_WIDTH, SEED, TIME, ArgumentError, Shown, SpadwarpWarning, check_integer, check_real
 
 if TYPE_CHECKING:
     import xarray

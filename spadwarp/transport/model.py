@@ -67,8 +67,10 @@ def build_model(
     `DeviceError`: the device has too little memory.
     """
     _check_places(scene, mesh, camera)
-    if camera:
-        _check_gate(scene)
+    begin, max_path = scene.gate.start * scene.medium.pulse_speed, scene.transport.max_path
+    if camera and max_path is not None and max_path <= begin:
+        text = f"transport.max_path = {max_path} m is outside ({begin:g}, inf) m, the path at which the gate begins"
+        raise ConfigError(text, source=scene.source)
     if scale is None:
         scale = tally_limits(scene, mesh).scale if camera else 1.0
     sea = None if scene.surface is None else _sea(scene, device)
@@ -622,14 +624,6 @@ def _check_places(scene: Scene, mesh: TriangleMesh | None, camera: bool = True) 
             if beyond > 0.0:
                 text = f"reaches {beyond:.4g} m through {face} of the domain, which has an outside_index"
                 raise ConfigError(f"{section}.{field}: {text}", source=scene.source)
-
-
-def _check_gate(scene: Scene) -> None:
-    """Refuses a gate that begins after the longest path."""
-    begin, max_path = scene.gate.start * scene.medium.pulse_speed, scene.transport.max_path
-    if max_path is not None and max_path <= begin:
-        text = f"transport.max_path = {max_path} m is outside ({begin:g}, inf) m, the path at which the gate begins"
-        raise ConfigError(text, source=scene.source)
 
 
 def _check_size(scene: Scene, model: sk.Model, copies: float, signed: int) -> bool:
