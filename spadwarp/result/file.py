@@ -16,7 +16,7 @@ from spadwarp.io.arrays import read_exr, write_exr
 from spadwarp.io.hdf5 import Coordinate, Hdf5File, image_chunks, name_dimensions, read_hdf5, write_hdf5, write_packed
 from spadwarp.io.paths import file_within
 from spadwarp.io.text import read_toml
-from spadwarp.result.photon_ids import Range, joined
+from spadwarp.result.photon_ids import joined
 from spadwarp.result.result import (
     ARRAYS,
     DIMENSION_OF,
@@ -345,6 +345,11 @@ def merge(results: Iterable[ResultLike]) -> Result:
         if problem := difference(first, other):
             raise ConfigError(f"merge: {problem}")
     ranges = joined(ids for part in parts for ids in part.photon_ranges)
+    provenance = list[dict[str, Any]]()  # of each part, with its photon ids
+    for part in parts:
+        made = dict(part.provenance)
+        provenance += made.pop("parts", None) or [{**made, "photon_ranges": [list(ids) for ids in part.photon_ranges]}]
+    head = {name: value for name, value in provenance[0].items() if name != "photon_ranges"}
     size = max(part.batch_size for part in parts)
     total = total_of(*(rebatched(part, size // part.batch_size if size else 1) for part in parts))
     return replace(
@@ -354,21 +359,11 @@ def merge(results: Iterable[ResultLike]) -> Result:
         batch_size=size,
         photons=sum(part.photons for part in parts),
         timing=added(*(part.timing for part in parts)),
-        provenance=_joined_provenance((part.provenance, part.photon_ranges) for part in parts),
+        provenance=head if len(provenance) == 1 else {**head, "parts": provenance},
         partial=any(part.partial for part in parts),
         photon_ranges=ranges,
         requested=(min(part.requested[0] for part in parts), max(part.requested[1] for part in parts)),
     )
-
-
-def _joined_provenance(parts: Iterable[tuple[Mapping[str, Any], Iterable[Range]]]) -> dict[str, Any]:
-    """The first provenance, and under `parts` each with its photon ids."""
-    each: list[dict[str, Any]] = []
-    for provenance, ranges in parts:
-        made = dict(provenance)
-        each += made.pop("parts", None) or [{**made, "photon_ranges": [list(ids) for ids in ranges]}]
-    head = {name: value for name, value in each[0].items() if name != "photon_ranges"}
-    return head if len(each) == 1 else {**head, "parts": each}
 
 
 # Images

@@ -356,10 +356,9 @@ class Result(Shown, ResultHead, Tallies):
         """
         if self.half is None or not 0 < self.half_photons < self.photons:
             raise ConfigError(NO_BATCHES)
-        rest = self.photons - self.half_photons
-        return Half(self.half, self.half_photons, self.tally_value * (self.photons / self.half_photons)), Half(
-            self.tallies - self.half, rest, self.tally_value * (self.photons / rest)
-        )
+        parts = (self.half, self.half_photons), (self.tallies - self.half, self.photons - self.half_photons)
+        even, odd = (Half(part, photons, self.tally_value * (self.photons / photons)) for part, photons in parts)
+        return even, odd
 
     @cached_property
     def noise_ratio(self) -> Floats:

@@ -46,7 +46,7 @@ class _Histogram:
     """A tally on the device, `[voxel * parts]`, and its batches, if any; `total` may be the caller's."""
 
     def __init__(
-        self, array: wp.array, components: int, *, signed: bool, batched: bool, total: wp.array | None = None
+        self, array: wp.array, components: int, *, batched: bool, signed: bool = False, total: wp.array | None = None
     ) -> None:
         self.array, self._signed = array, signed
         halved = not signed and components > 1
@@ -108,18 +108,16 @@ class DeviceWorker:
         total = None if tallies is None else caller_tallies(tallies, shape=self._shape, device=model.device)
         self.model, self._spec, self._seed, self._signed = model, spec, seed, signed
         self._threads, self._launch_size, self._batch_size = threads, launch_size, batch_size
-        batched = batch_size > 0
+        components, batched = len(self._names), batch_size > 0
         with device_errors(model.device):
             own = None if batched else total
             self.data = sk.make_data(model, tally=own, histogram=not spec.records, derivatives=len(signed))
-            components = len(self._names)
-            self._histograms = [_Histogram(self.data.tally, components, signed=False, batched=batched, total=total)]
+            self._histograms = [_Histogram(self.data.tally, components, batched=batched, total=total)]
             if self.data.gradients is not None:
-                self._histograms.append(_Histogram(self.data.gradients, components, signed=True, batched=batched))
+                self._histograms.append(_Histogram(self.data.gradients, components, batched=batched, signed=True))
             if self.data.flux is not None:
-                self._histograms.append(_Histogram(self.data.flux, 1, signed=False, batched=batched))
+                self._histograms.append(_Histogram(self.data.flux, 1, batched=batched))
             # Compiles, or loads from Warp's cache, before the time of the launches is taken.
-            self._most = min(launch_size, batch_size or launch_size)
             sk.load_transport_kernel(spec, model.device)
         self._closed = list[Tallies]()  # what closed batches left beside their arrays
         self._unread = list[tuple[int, bool]]()  # batches closed on the device: photons, and whether in the half
@@ -142,7 +140,7 @@ class DeviceWorker:
         done, size = list[Range](), self._batch_size or block[1]
         edges = [block[0], *range((block[0] // size + 1) * size, block[1], size), block[1]]
         with device_errors(self.model.device):
-            most = min(self._most, block[1] - block[0])
+            most = min(self._launch_size, size, block[1] - block[0])
             launch = sk.prepare_transport(self._spec, self.model, self.data, seed=self._seed, photon_count=most)
             for part in itertools.pairwise(edges):
                 traced = self._trace(part, launch, stopped, report)
