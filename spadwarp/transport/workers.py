@@ -11,8 +11,8 @@ import time
 import weakref
 from collections import deque
 from collections.abc import Callable, Iterator, Sequence
-from concurrent.futures import ThreadPoolExecutor
-from contextlib import contextmanager, suppress
+from concurrent.futures import FIRST_COMPLETED, Future, ThreadPoolExecutor, wait
+from contextlib import contextmanager
 from dataclasses import replace
 from typing import Any, NamedTuple
 
@@ -413,53 +413,40 @@ class LocalWorkers:
         self.timing = {"setup": built - began, "compile": time.perf_counter() - traced, "truth": traced - built}
         self.first_block = threads * size
         self._devices, self._stopped = devices, threading.Event()
-        self._events: queue.SimpleQueue[Event] = queue.SimpleQueue()
-        self._busy, self._failures = set[Worker](), list[BaseException]()
+        self._pool, self._pending = ThreadPoolExecutor(len(devices)), dict[Future[Any], Worker]()
+        self._reported: queue.SimpleQueue[Event] = queue.SimpleQueue()
         self.workers = [Worker(device.alias, threads, self._stopped) for device in devices]
         for worker, tracer in zip(self.workers, self.tracers, strict=True):
             worker.state |= {
                 "tracer": tracer,
-                "report": lambda n, who=worker: self._events.put(Event("progress", who, n)),
+                "report": lambda n, who=worker: self._reported.put(Event("progress", who, n)),
             }
 
     @property
     def idle(self) -> list[Worker]:
-        return [] if self._failures else [worker for worker in self.workers if worker not in self._busy]
+        busy = self._pending.values()
+        return [worker for worker in self.workers if worker not in busy]
 
     def send(self, worker: Worker, work: Callable[..., Any], *arguments: Any) -> None:
         """Lets an idle worker run `work(*arguments, worker)`."""
-
-        def run() -> None:
-            try:
-                self._events.put(Event("returned", worker, work(*arguments, worker)))
-            except BaseException as error:
-                self._stopped.set()
-                self._events.put(Event("failed", worker, error))
-
-        self._busy.add(worker)
-        threading.Thread(target=run, daemon=True).start()
+        self._pending[self._pool.submit(work, *arguments, worker)] = worker
 
     def collect(self, worker: Worker) -> None:
         """Tallies stay where they are: `tallies` adds them up when all workers rest."""
-        self._busy.add(worker)
-        self._events.put(Event("returned", worker))
+        self.send(worker, lambda worker: None)
 
     def stop(self) -> None:
         self._stopped.set()
 
     def wait(self) -> list[Event]:
         """As `RayWorkers.wait`, and "progress": more photons of a worker's block are done."""
-        events: list[Event] = []
-        with suppress(queue.Empty):
-            # With a timeout: Python handles a signal only when the wait for a lock ends.
-            events.append(self._events.get(timeout=0.1))
-            while True:
-                events.append(self._events.get_nowait())
-        self._busy -= {event.worker for event in events if event.kind != "progress"}
-        self._failures += [event.value for event in events if event.kind == "failed"]
-        if self._failures and not self._busy:
-            raise self._failures[0]
-        return [event for event in events if event.kind != "failed"]
+        # With a timeout: Python handles a signal only when the wait for a lock ends.
+        done = wait(self._pending, timeout=0.1, return_when=FIRST_COMPLETED).done
+        if any(future.exception() for future in done):
+            self.stop()
+            wait(self._pending)  # until all rest
+        events = [self._reported.get() for _ in range(self._reported.qsize())]
+        return events + [Event("returned", self._pending.pop(future), future.result()) for future in done]
 
     def tallies(self) -> Tallies:
         """Those of all devices, added up on the first; on CPUs in its own memory."""
