@@ -137,13 +137,28 @@ class DeviceWorker:
 
         `report` gets the photons of each launch, from the thread that ran it.
         """
-        done, size = list[Range](), self._batch_size or block[1]
+        done, size, device = list[Range](), self._batch_size or block[1], self.model.device
         edges = [block[0], *range((block[0] // size + 1) * size, block[1], size), block[1]]
-        with device_errors(self.model.device):
-            most = min(self._launch_size, size, block[1] - block[0])
+        most = min(self._launch_size, size, block[1] - block[0])
+
+        def run(span: Range) -> Ranges:
+            first, stop = span
+            if stopped.is_set():
+                return ()
+            launch(first, stop - first)
+            if device.is_cuda:  # where it may still be under way
+                self._running.append((stop - first, device.stream.record_event()))
+                self._wait(report, ahead=1)
+            else:
+                report(stop - first)
+            return (span,)
+
+        # What fails cancels what has not begun.
+        with device_errors(device), ThreadPoolExecutor(self._threads) as pool:
             launch = sk.prepare_transport(self._spec, self.model, self.data, seed=self._seed, photon_count=most)
+            run_all = pool.map if self._threads > 1 else map
             for part in itertools.pairwise(edges):
-                traced = self._trace(part, launch, stopped, report)
+                traced = joined(itertools.chain(*run_all(run, self._spans(part))))
                 if self._batch_size and traced:
                     self._close_batch(traced)
                 done += traced
@@ -154,36 +169,16 @@ class DeviceWorker:
             self._check_overflow()
         return joined(done)
 
+    def _spans(self, ids: Range) -> Iterator[Range]:
+        """Of launches: shorter ones towards the end so that all threads end at about the same time."""
+        waiting, parts = IdQueue([ids]), 2 * self._threads if self._threads > 1 else 1
+        while span := waiting.take(min(self._launch_size, max(waiting.left // parts, self._launch_size // 16, 1))):
+            yield span
+
     def _check_overflow(self) -> None:
         """After every block of photons, long before an integer could wrap around and look right again."""
         if any(histogram.has_overflowed() for histogram in self._histograms):
             raise SpadwarpError(OVERFLOW)
-
-    def _trace(
-        self, ids: Range, launch: Callable[[int, int], None], stopped: threading.Event, report: Callable[[int], None]
-    ) -> Ranges:
-        """Traces the ids with all threads; on a GPU the last launch may still be under way."""
-        device: Any = self.model.device
-        spans, waiting, parts = list[Range](), IdQueue([ids]), 2 * self._threads if self._threads > 1 else 1
-        # Fewer towards the end so that all threads end at about the same time.
-        while span := waiting.take(min(self._launch_size, max(waiting.left // parts, self._launch_size // 16, 1))):
-            spans.append(span)
-
-        def trace(span: Range) -> Ranges:
-            first, stop = span
-            if stopped.is_set():
-                return ()
-            launch(first, stop - first)
-            if device.is_cuda:
-                self._running.append((stop - first, device.stream.record_event()))
-                self._wait(report, ahead=1)
-            else:
-                report(stop - first)
-            return (span,)
-
-        with ThreadPoolExecutor(self._threads) as pool:  # what fails cancels what has not begun
-            done = list((pool.map if self._threads > 1 else map)(trace, spans))
-        return joined(itertools.chain(*done))
 
     def _close_batch(self, ids: Ranges) -> None:
         """Adds a batch of these photons to the totals."""
