@@ -34,12 +34,10 @@ def without(span: Range, done: Ranges) -> Ranges:
     """The parts of a span that are not in `done`, which are joined ranges."""
     left: list[Range] = []
     start, stop = span
-    for first, last in done:
+    for first, last in (*done, (stop, stop)):
         if start < min(first, stop):
             left.append((start, min(first, stop)))
         start = max(start, last)
-    if start < stop:
-        left.append((start, stop))
     return tuple(left)
 
 
@@ -66,25 +64,26 @@ class IdQueue:
     """Ids that wait, taken from the front; those of lost workers are put back."""
 
     def __init__(self, ranges: Iterable[Range]) -> None:
-        self._ranges = list[Range]()
-        self.put_back(ranges)
+        self._ranges = sorted(ranges)
+
+    @property
+    def left(self) -> int:
+        """How many wait."""
+        return count(self._ranges)
 
     def take(self, size: int, unit: int = 1) -> Range | None:
         """At most `size` ids, up to a multiple of `unit` where more are left; None if none are left."""
         if not self._ranges:
             return None
-        start, stop = self._ranges.pop()
-        end = (start // unit + max(size // unit, 1)) * unit
-        if stop > end:
-            self._ranges.append((end, stop))
-            stop = end
-        self.left -= stop - start
-        return start, stop
+        start, stop = self._ranges.pop(0)
+        end = min((start // unit + max(size // unit, 1)) * unit, stop)
+        if end < stop:
+            self._ranges.insert(0, (end, stop))
+        return start, end
 
     def put_back(self, ranges: Iterable[Range]) -> None:
         """Ids that are to be done again."""
-        self._ranges = sorted([*self._ranges, *ranges], reverse=True)
-        self.left = count(self._ranges)
+        self._ranges = sorted([*self._ranges, *ranges])
 
 
 def photons_per_position(scene: Scene, photon_ranges: Sequence[Range]) -> NDArray[np.float64]:
