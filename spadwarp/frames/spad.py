@@ -545,13 +545,11 @@ def _draw(
     receiver: Receiver, hazard: Any, numbers: dict[str, int], *, summed: bool, tags: bool, out: Any
 ) -> tuple[Any, TimeTags | None]:
     """Counts, in the tensor `out` where there is one, and for tags the detections one by one."""
-    import warp as wp
-
     detector, window = receiver.detector, receiver.window
     by_event = detector.mode == "free_running" or tags or detector.afterpulsing_probability > 0
     add_frames = by_event and summed  # the kernel of events does not
     in_place = out is not None and not add_frames
-    given = wp.from_torch(out).flatten() if in_place else None
+    given = as_warp(out, name="out").flatten() if in_place else None
     common: dict[str, Any] = {**numbers, "counter_depth": detector.max_count, "counts": given}
     found = None
     if by_event:
