@@ -126,7 +126,7 @@ LINES = {
     "parallel": (600, 566),
     "result": (1500, 2137),
     "scene": (3700, 5230),
-    "transport": (2300, 3332),
+    "transport": (2300, 3341),
     "validate": (750, 794),
     "viz": (2200, 2559),
     "water": (800, 852),
