@@ -74,9 +74,9 @@ class Spectrum:
         whole, first, signed = math.fsum(shares.values()), runs[0], runs[0].signed_tallies
         # Of each histogram, channel or derivative the lines. A bin is as long at all wavelengths; what a tally unit
         # stands for may differ from line to line.
-        for lines in zip(*map(_tallies_and_units, runs), strict=True):
-            light, unit = np.zeros(first.tallies.shape), min(own for _, own in lines)
-            for (wavelength, one), (tallies, own) in zip(self.results.items(), lines, strict=True):
+        for cubes in zip(*map(_tallies_and_units, runs), strict=True):
+            light, unit = np.zeros(first.tallies.shape), min(own for _, own in cubes)
+            for (wavelength, one), (tallies, own) in zip(self.results.items(), cubes, strict=True):
                 light += shares[wavelength] / max(whole, 1e-300) * (own * one.photons) * tallies
             summed.append((np.rint(light / (unit * first.photons)).astype(np.int64), unit))
         histograms, units = zip(*summed, strict=True)
