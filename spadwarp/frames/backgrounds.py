@@ -2,10 +2,10 @@
 
 Ambient light and dark counts are constant over the gate; backscatter decays, as exp(−2 c z) / z² or by several laws at
 once. All of these are sums of decaying exponentials with weights >= 0 (completely monotone functions, Bernstein 1929),
-and of a constant. Before a gate is open they rise, by any course. The weights are those of the highest Poisson
-likelihood of the counts outside the returns of targets. Returns are found where the counts of a block of pixels exceed
-the background within the time of the response; whatever all blocks share at the same time and does not fit into a decay
-counts as a return, too.
+and of a constant. Walls end the water before them: the mean over pixels may fall by any course. Before a gate is open
+it rises, by any course. The weights are those of the highest Poisson likelihood of the counts outside the returns of
+targets. Returns are found where the counts of a block of pixels exceed the background within the time of the response;
+whatever all blocks share at the same time and does not fit into a decay counts as a return, too.
 """
 
 from __future__ import annotations
@@ -44,6 +44,7 @@ class Background(NamedTuple):
     relative_error: float  # standard error of its sum over the gate, relative; of the fit alone
     interpolated: float  # part of the bins in which returns leave less than a tenth of the pixels
     decays: bool
+    falls: bool  # by a course that is no sum of decays, as walls end the water
 
     @property
     def counts(self) -> NDArray[np.float32]:
@@ -53,7 +54,7 @@ class Background(NamedTuple):
     @property
     def summary(self) -> str:
         """One sentence for the user."""
-        law = "decays and a constant" if self.decays else "a constant"
+        law = "a falling course" if self.falls else "decays and a constant" if self.decays else "a constant"
         text = f"background estimated from the frame: {law}, {self.per_bin.sum():.3g} counts in a pixel"
         text += f" ± {percent(self.relative_error)} %"
         if self.scale is not None:
@@ -81,23 +82,32 @@ def estimate_background(counts: ArrayLike, response: ArrayLike | float, *, law: 
         raise ArgumentError(f"counts have shape {cube.shape}; [H, W, T] or [N, H, W, T] is needed")
     bins = cube.shape[-1]
     if law == "none":
-        return Background(np.zeros(bins, np.float32), None, 0.0, 0.0, False)
+        return Background(np.zeros(bins, np.float32), None, 0.0, 0.0, False, False)
     blocks, pixels = _blocks(cube.reshape(-1, *cube.shape[-3:]))
-    return _estimated(blocks, pixels, return_width(response), _RATES[:1] if law == "flat" else _RATES, cube.shape)
+    given = blocks, pixels, return_width(response), _RATES[:1] if law == "flat" else _RATES, cube.shape
+    found, opens = _course(*given, law == "decay")
+    if not opens:
+        return found
+    # Few early counts mean that a gate opens, or that returns follow: what leaves the smaller error counts.
+    return min(found, _course(*given, False)[0], key=lambda one: one.relative_error)
 
 
-def _estimated(
+def _course(
     blocks: NDArray[np.float64],
     pixels: NDArray[np.float64],
     width: int,
     rates: NDArray[np.float64],
     shape: tuple[int, ...] | None,
-) -> Background:
-    """The background of blocks of counts of this shape; `width`: of a return [bins]."""
+    may_open: bool,
+) -> tuple[Background, bool]:
+    """The background of blocks of counts of this shape, and whether the gate opens, within its first half, if it may.
+
+    `width`: of a return [bins].
+    """
     from scipy.ndimage import uniform_filter1d
 
     total, begin = blocks.sum(axis=0), 0
-    if len(rates) > 1:
+    if may_open:
         begin = int(uniform_filter1d(total, width).argmax())  # a gate that opens has its most counts when it is open
         begin = begin if begin < total.size // 2 else 0
     exposure = np.where(np.arange(total.size) < begin, 0.0, pixels.sum())
@@ -110,15 +120,21 @@ def _estimated(
         scaled = pixels * scale
         free = ~_returns(blocks, (1.0 + tolerance) * scaled[:, None] * level * opening, width)
         seen, exposure = (blocks * free).sum(axis=0), scaled @ free
-        if len(rates) > 1:
+        if may_open:
             opening = _opening(seen, exposure * level)
         whole = opening == 1.0
         level, weight, gain = _fit(seen * whole, exposure * whole, rates, weight)
         level = np.where(whole, level, level[whole.argmax()])  # before the gate is open, no decay can be seen
     level, _, gain = _fit(seen * whole, exposure * whole, rates, weight, _LAST_STEPS)
-    decays = gain > _DECAYS
+    decays, falls = gain > _DECAYS, False
     if not decays:
         level, *_ = _fit(seen * whole, exposure * whole, _RATES[:1])
+    elif shape is not None:  # of counts: depths alone are too few for it
+        falling = _falling(seen * whole, exposure * whole, level, pixels.sum())
+        if falls := falling is not level:
+            free = ~_returns(blocks, (1.0 + tolerance) * scaled[:, None] * falling * opening, width)
+            seen, exposure = (blocks * free).sum(axis=0), scaled @ free
+            level = _falling(seen * whole, exposure * whole, level, pixels.sum())
     level = np.where(whole, level, level[whole.argmax()])
     if not whole.all():
         level = np.maximum(level * _opening(seen, exposure * level), 1e-9)
@@ -132,7 +148,7 @@ def _estimated(
         rows, columns = (-(-side // _BLOCK) for side in shape[-3:-1])
         image = np.kron(scale.reshape(rows, columns), np.ones((_BLOCK, _BLOCK))).astype(np.float32)
         image = image[: shape[-3], : shape[-2]]
-    return Background(level.astype(np.float32), image, error, hidden, bool(decays))
+    return Background(level.astype(np.float32), image, error, hidden, bool(decays), falls), not whole.all()
 
 
 def _opening(seen: NDArray[np.float64], expected: NDArray[np.float64]) -> NDArray[np.float64]:
@@ -151,6 +167,27 @@ def _opening(seen: NDArray[np.float64], expected: NDArray[np.float64]) -> NDArra
     deviance = float((few * np.log(np.maximum(few, 1e-9) / usual) - few + usual).sum())
     opens = deviance > np.log(seen.size) + _FALSE and known[there].sum() < 0.5 * known.sum() and there.mean() < 0.5
     return part if opens else np.ones(seen.size)
+
+
+def _falling(
+    seen: NDArray[np.float64], exposure: NDArray[np.float64], level: NDArray[np.float64], pixels: float
+) -> NDArray[np.float64]:
+    """Any falling course where by it the counts are clearly more likely than by decays: walls end the water.
+
+    Isotonic regression of the counts; linear between the bins that returns leave free.
+    """
+    from scipy.optimize import isotonic_regression
+
+    free = np.flatnonzero(exposure > 0.1 * pixels)
+    if len(free) < 2:
+        return level
+    part = seen[free] / exposure[free]
+    found = np.maximum(isotonic_regression(part, weights=exposure[free], increasing=False).x, 1e-9)
+    gain = (seen[free] * np.log(found / level[free])).sum() - ((found - level[free]) * exposure[free]).sum()
+    levels = len(np.unique(found))
+    if gain < levels * np.log(len(free)):
+        return level
+    return np.interp(np.arange(level.size), free, found)
 
 
 def _blocks(frames: NDArray[Any]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
@@ -289,7 +326,7 @@ def profile_of_depth(depth: NDArray[np.float32], gate: tuple[float, float]) -> N
     blocks = np.bincount(index, minlength=count * _PROFILE_BINS).reshape(count, -1).astype(np.float64)
     pixels = _blocks(np.ones((*some.shape, 1)))[0][:, 0]
     chosen = slice(None, None, -(-count // _PROFILE_BLOCKS))
-    found = _estimated(blocks[chosen], pixels[chosen], 1, _RATES, None)
+    found, _ = _course(blocks[chosen], pixels[chosen], 1, _RATES, None, True)
     return found.per_bin.astype(np.float64) if found.decays else None
 
 

@@ -50,6 +50,26 @@ def test_a_return_that_all_pixels_share_is_no_background():
     assert np.abs(found.per_bin - level).sum() < 0.05 * level.sum() and 0.05 < found.interpolated < 0.3
 
 
+def test_a_wall_ends_the_water_before_it():
+    """A slanted wall over half of the gate: decays alone miss a third of such a background."""
+    clean = 14.5 + 0.9 * np.linspace(0.0, 1.0, SIZE[1]) + np.zeros(SIZE)
+    wall = (clean[..., None] - 13.5) / 2.5 > PLACE
+    level = 80.0 * np.exp(-PLACE) / BINS * wall + 0.01
+    found = estimate_background(counts_of(clean, 0.0, 15.0) + np.random.default_rng(4).poisson(level), TAPS)
+    mean = level.mean(axis=(0, 1))
+    assert found.falls and "a falling course" in found.summary
+    assert np.abs(found.per_bin - mean).sum() < 0.15 * mean.sum()
+
+
+def test_dim_returns_are_no_gate_that_opens():
+    """Half a photon a pixel, from a surface that bends away: the counts before it are the background's."""
+    clean = 13.8 + 0.8 * np.linspace(0.0, 1.0, SIZE[1]) ** 2 + np.zeros(SIZE)
+    level = backscatter(0.8)
+    for seed in range(2, 8):
+        found = estimate_background(counts_of(clean, level, 0.5, seed=seed), TAPS)
+        assert np.abs(found.per_bin - level)[:20].sum() < 0.5 * level[:20].sum()
+
+
 def test_ambient_light_may_follow_the_reflectance():
     """Neighbours on both sides of an edge have a background that differs four times; the mean is that of all pixels."""
     scale = np.where(np.arange(SIZE[1]) < 32, 0.4, 1.6)
