@@ -7,11 +7,11 @@ from collections.abc import Mapping, Sequence
 from typing import Annotated, Any, Literal, Self
 
 import pydantic
-from pydantic import AfterValidator, BeforeValidator, Field
+from pydantic import AfterValidator, Field
 
 from spadwarp.io.paths import example_or_path
 from spadwarp.io.text import read_toml
-from spadwarp.scene.sections import Document, Section, Whole, listed
+from spadwarp.scene.sections import Document, Section, Whole
 
 __all__ = ["TrainingRecipe", "load_training_recipe"]
 
@@ -31,9 +31,8 @@ def _ordered(limits: tuple[float, float]) -> tuple[float, float]:
 
 Share = Annotated[float, Field(ge=0, le=1)]
 Above0 = Annotated[float, Field(ge=1e-9, le=1e9)]
-_CHECKS = BeforeValidator(listed), AfterValidator(_ordered)
-Positive = Annotated[tuple[Above0, Above0], *_CHECKS]
-Shares = Annotated[tuple[Share, Share], *_CHECKS]
+Positive = Annotated[tuple[Above0, Above0], AfterValidator(_ordered)]
+Shares = Annotated[tuple[Share, Share], AfterValidator(_ordered)]
 
 
 class Noise(Section):

@@ -22,7 +22,7 @@ from pydantic import BeforeValidator, Field, model_validator
 from spadwarp.io.text import parse_json, read_text, write_text
 from spadwarp.scene.port import Port
 from spadwarp.scene.pose import rotation_matrix
-from spadwarp.scene.sections import AnyFile, Coordinate, Infinite, Section, Vector, Whole, field, field_range, listed
+from spadwarp.scene.sections import AnyFile, Coordinate, Infinite, Section, Vector, Whole, field, field_range
 from spadwarp.values import ArgumentError, ConfigError, FileError, check_integer, read_real, shown
 
 __all__ = ["Camera", "load_calibration", "save_calibration"]
@@ -34,7 +34,6 @@ _INTRINSICS = ("fx", "fy", "cx", "cy", "calibration")
 
 def _padded(value: Any) -> Any:
     """Four coefficients of distortion lack k3, as OpenCV allows."""
-    value = listed(value)
     return (*value, 0.0) if isinstance(value, tuple) and len(value) == 4 else value
 
 

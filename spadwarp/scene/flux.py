@@ -8,19 +8,17 @@ from typing import Annotated, Literal, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
-from pydantic import BeforeValidator, Field
+from pydantic import Field
 
 from spadwarp.io.hdf5 import Coordinate
 from spadwarp.scene.pose import sideways, unit_vector
-from spadwarp.scene.sections import Corner, Direction, Section, Vector, Whole, field, listed
+from spadwarp.scene.sections import Corner, Direction, Section, Vector, Whole, field
 
 __all__ = ["Flux", "Sun"]
 
 IRRADIANCES = ("downward", "upward", "scalar_downward", "scalar_upward")
 _Edge = Annotated[int, Field(ge=1, le=1024)]
-_Voxels = Annotated[tuple[_Edge, _Edge, _Edge], BeforeValidator(listed)]
 _Position = Annotated[float, Field(ge=-1e9, le=1e9)]
-_Positions = Annotated[tuple[_Position, ...], BeforeValidator(listed)]
 
 
 class FluxArray(NamedTuple):
@@ -44,7 +42,7 @@ class Flux(Section):
 
     name: str = Field(pattern=r"^[A-Za-z][A-Za-z0-9_]*$", max_length=64)
     """name in the result, of letters, digits and _"""
-    voxels: _Voxels | None = None
+    voxels: tuple[_Edge, _Edge, _Edge] | None = None
     """number of voxels of a box along x, y and z; along an edge without bounds 1"""
     lower: Corner = field((-math.inf,) * 3, "lower corner of the box [m]; one number for all three")
     upper: Corner = field((math.inf,) * 3, "upper corner of the box [m]; one number for all three")
@@ -54,7 +52,7 @@ class Flux(Section):
     estimator: Literal["track", "collision"] = "track"
     """by the way of each photon through the voxels (less noise a photon), or by its collisions (less noise a second on
     a GPU where a voxel is .1 free paths wide or more)"""
-    positions: _Positions | None = Field(None, min_length=1, max_length=65536)
+    positions: tuple[_Position, ...] | None = Field(None, min_length=1, max_length=65536)
     """of planes along `axis` [m], rising"""
     axis: Direction = field((0.0, 0.0, 1.0), "normal of the planes, downwards; any length but 0")
     radius: float = field(math.inf, "of the part of each plane that is tallied [m]; inf: all of it", "(0, inf]")

@@ -14,7 +14,7 @@ from typing import Annotated, Any, ClassVar, Literal, NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
-from pydantic import BeforeValidator, Field
+from pydantic import Field
 
 from spadwarp.arrays import Floats
 from spadwarp.io.arrays import read_exr, read_npy
@@ -30,7 +30,6 @@ from spadwarp.scene.sections import (
     field,
     field_range,
     file_of,
-    listed,
     read_table,
 )
 from spadwarp.scene.settings import Detector
@@ -70,8 +69,7 @@ class Laser(Section):
     linewidth_nm: float = field(0.0, "of a Gaussian spectrum, width at half maximum [nm]; 0: one line", "[0, 100000]")
     spectrum: CsvFile = field(None, "a measured spectrum: .csv file of wavelength [nm] and power per nm of any scale")
     wavelengths_nm: (
-        Literal["spectrum"]
-        | Annotated[tuple[Annotated[float, Field(ge=1e-9, le=1e6)], ...], BeforeValidator(listed), Field(max_length=64)]
+        Literal["spectrum"] | Annotated[tuple[Annotated[float, Field(ge=1e-9, le=1e6)], ...], Field(max_length=64)]
     ) = ()
     """lines that `spadwarp simulate` traces with the same photons, each in its own water [nm]; "spectrum": those of the
     laser's spectrum that the filter passes; everything else takes wavelength_nm"""

@@ -12,7 +12,7 @@ from typing import Annotated, Any, ClassVar, Literal, NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike
-from pydantic import BeforeValidator, Field, PrivateAttr, field_validator
+from pydantic import Field, PrivateAttr, field_validator
 
 from spadwarp.arrays import Floats
 from spadwarp.scene.grid import COEFFICIENTS, Grid, GridCells, cells_of
@@ -27,7 +27,7 @@ from spadwarp.scene.sections import (
     field,
     field_range,
     file_of,
-    listed,
+    from_one,
     read_table,
 )
 from spadwarp.values import ConfigError, bounds, pulse_speed
@@ -157,8 +157,7 @@ class Constituent(PhaseLaw):
 
 
 # One for the medium and one for each layer, or one for all.
-_one_or_more = BeforeValidator(lambda value: (value,) if isinstance(value, int | float) else listed(value))
-ByWater = Annotated[tuple[Annotated[float, Field(ge=0, le=1e6)], ...], _one_or_more]
+ByWater = Annotated[tuple[Annotated[float, Field(ge=0, le=1e6)], ...], from_one(1)]
 
 
 class Inelastic(Section):
@@ -298,10 +297,10 @@ class Medium(PhaseLaw, Water):
     """tabulated: path of a .csv file of angle [°], m12, m22, m33, m34 and m44 over m11; `spadwarp water` writes one
     """
     largest_polarisation: float = field(0.66, "scaled_rayleigh: polarisation of light at 90°", RANGES["largest"])
-    constituents: Annotated[tuple[Constituent, ...], BeforeValidator(listed), Field(max_length=MOST_CONSTITUENTS)] = ()
+    constituents: Annotated[tuple[Constituent, ...], Field(max_length=MOST_CONSTITUENTS)] = ()
     """what the water is made of, in place of coefficients and phase function: their coefficients add up, those of pure
     water among them; at most 4"""
-    inelastic: Annotated[tuple[Inelastic, ...], BeforeValidator(listed), Field(max_length=2)] = ()
+    inelastic: Annotated[tuple[Inelastic, ...], Field(max_length=2)] = ()
     """light of other wavelengths, one of each process, which the absorption has lost; not with grid"""
     group_index: float = Field(WATER_INDICES["seawater"][1], ge=1, le=3)
     """index for the time of flight; "seawater" and "fresh" stand for 1.3638 and 1.3566"""
@@ -309,7 +308,7 @@ class Medium(PhaseLaw, Water):
     """refractive index; "seawater" and "fresh" stand for 1.3415 and 1.3350"""
     temperature: float | None = field(None, "gives missing indices, with salinity 35 [°C]", RANGES["temperature"])
     salinity: float | None = field(None, "the same, with temperature 20 [g/kg]", RANGES["salinity"])
-    layers: Annotated[tuple[Layer, ...], BeforeValidator(listed)] = field((), "waters further along `layer_axis`")
+    layers: tuple[Layer, ...] = field((), "waters further along `layer_axis`")
     layer_axis: Direction = field((0.0, 0.0, 1.0), "direction across the layers, in the world; not 0")
     grid: Grid | None = field(None, "water that varies within a box, cell by cell; not with layers")
     _molecular_share: float = PrivateAttr(0.0)

@@ -8,11 +8,10 @@ import os
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, Any, Literal, NamedTuple, get_args
+from typing import Any, Literal, NamedTuple, get_args
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
-from pydantic import BeforeValidator
 
 from spadwarp.io.paths import MESH_ENDINGS, example_or_path, used
 from spadwarp.io.text import csv_lines, read_text, read_toml
@@ -23,7 +22,7 @@ from spadwarp.scene.medium import Medium
 from spadwarp.scene.port import Port, PortGeometry
 from spadwarp.scene.pose import rotation_angles, rotation_matrix, turned, unit_vector, vector_of
 from spadwarp.scene.sea import Surface
-from spadwarp.scene.sections import Document, Overrides, listed
+from spadwarp.scene.sections import Document, Overrides
 from spadwarp.scene.settings import Analytic, Daylight, Detector, Domain, Gate, Output, Scan, Target, Transport
 from spadwarp.values import ArgumentError, ConfigError, FileError, Shown, check_integer, check_real, read_real, shown
 
@@ -47,10 +46,10 @@ class Scene(Shown, Document):
     gate: Gate
     surface: Surface | None = None
     daylight: Daylight | None = None
-    targets: Annotated[tuple[Target, ...], BeforeValidator(listed)] = ()
+    targets: tuple[Target, ...] = ()
     domain: Domain = Domain()
     sun: Sun | None = None
-    flux: Annotated[tuple[Flux, ...], BeforeValidator(listed)] = ()
+    flux: tuple[Flux, ...] = ()
     transport: Transport = Transport()
     output: Output = Output()
     analytic: Analytic = Analytic()

@@ -77,23 +77,9 @@ def field(default: Any, text: str, within: str | None = None) -> Any:
     return Field(default, description=text, allow_inf_nan=math.inf in limits.values() or None, **limits)
 
 
-def listed(value: Any) -> Any:
-    """TOML has lists; what is frozen holds tuples."""
-    return tuple(value) if isinstance(value, list) else value
-
-
-def _whole(value: Any) -> Any:
-    """TOML writes 2e9 as a float; a whole one is as good as an integer."""
-    return int(value) if isinstance(value, float) and value.is_integer() else value
-
-
-def _from_one(count: int) -> BeforeValidator:
+def from_one(count: int) -> BeforeValidator:
     """One number stands for as many."""
-
-    def repeated(value: Any) -> Any:
-        return (value,) * count if isinstance(value, int | float) and not isinstance(value, bool) else listed(value)
-
-    return BeforeValidator(repeated)
+    return BeforeValidator(lambda value: (value,) * count if type(value) in (int, float) else value)
 
 
 def _with_length(vector: tuple[float, ...]) -> tuple[float, ...]:
@@ -102,16 +88,17 @@ def _with_length(vector: tuple[float, ...]) -> tuple[float, ...]:
     return vector
 
 
-Whole = Annotated[int, BeforeValidator(_whole)]
+# TOML writes 2e9 as a float; a whole one is as good as an integer.
+Whole = Annotated[int, BeforeValidator(lambda x: int(x) if isinstance(x, float) and x.is_integer() else x)]
 # Every number has a range in which products of several stay within single precision.
 Coordinate = Annotated[float, Field(ge=-1e9, le=1e9)]
-Vector = Annotated[tuple[Coordinate, Coordinate, Coordinate], BeforeValidator(listed)]
+Vector = tuple[Coordinate, Coordinate, Coordinate]
 Direction = Annotated[Vector, AfterValidator(_with_length)]
 Infinite = BeforeValidator(lambda value: math.inf if value == "infinity" else value)
 Bound = Annotated[float, Field(ge=-math.inf, le=math.inf, allow_inf_nan=True)]
-Corner = Annotated[tuple[Bound, Bound, Bound], _from_one(3)]
-Scale = Annotated[tuple[Coordinate, Coordinate, Coordinate], _from_one(3)]
-_UP_TO_THREE = _from_one(1), Field(min_length=1, max_length=3)
+Corner = Annotated[tuple[Bound, Bound, Bound], from_one(3)]
+Scale = Annotated[tuple[Coordinate, Coordinate, Coordinate], from_one(3)]
+_UP_TO_THREE = from_one(1), Field(min_length=1, max_length=3)
 Size = Annotated[tuple[Annotated[float, Field(ge=1e-9, le=1e9)], ...], *_UP_TO_THREE]
 Counts = Annotated[tuple[Annotated[int, Field(ge=1, le=1024)], ...], *_UP_TO_THREE]
 AnyFile = Annotated[str | None, FilePath()]
@@ -193,12 +180,7 @@ class Section(_Model):
     """
 
     model_config = ConfigDict(
-        defer_build=True,
-        frozen=True,
-        extra="forbid",
-        strict=True,
-        allow_inf_nan=False,
-        protected_namespaces=(),
+        defer_build=True, frozen=True, extra="forbid", strict=True, allow_inf_nan=False, protected_namespaces=()
     )
     section: ClassVar[str] = ""
     """Whose presets it takes."""
@@ -232,11 +214,11 @@ class Section(_Model):
     @field_validator("*", mode="before")
     @classmethod
     def _read(cls, value: Any, info: ValidationInfo) -> Any:
-        """Numbers with a unit as numbers; names of presets and endings of files are checked."""
+        """Numbers with a unit as numbers, TOML's lists as tuples; names of presets and endings of files are checked."""
         name = info.field_name or ""
         value = in_field_unit(value, field := cls.model_fields[name])
         if not isinstance(value, str):
-            return value
+            return tuple(value) if isinstance(value, list) else value
         if name == "preset" and value not in PRESETS[cls.section]:
             raise ValueError("preset", tuple(PRESETS[cls.section]))
         path = file_path(field)
@@ -731,7 +713,10 @@ def describe(error: ValidationError, model: type[BaseModel], overrides: Mapping[
     problems = error.errors(include_url=False)
     located = [(*locate(model, problem["loc"]), problem) for problem in problems[:_MOST]]
     values = [key for key, _, problem in located if problem["type"] != "literal_error"]  # which count, not the words
+    lists = {key[:-1] for key, _, _ in located}  # without their wrong items they may seem too short
     for key, info, problem in located:
+        if problem["type"] == "too_short" and key in lists:
+            continue
         if problem["type"] != "literal_error" or not any(one[: len(key)] == key for one in values):
             lines.setdefault(key, _line(key, info, problem, model, _is_overridden(key, overrides)))
     more = [f"{len(problems) - _MOST} more problems"] if len(problems) > _MOST else []
@@ -847,7 +832,7 @@ def _instead(key: Key, info: FieldInfo | None, kind: str, value: Any) -> str:
         return _factor(key, value)
     if not isinstance(value, str):
         fields, once = list(models[0].model_fields), f", of which there is one; write [{key_text(key)}]"
-        return once if isinstance(value, list) else f" of {', '.join(fields[:8])}{', ...' * (len(fields) > 8)}"
+        return once if isinstance(value, list | tuple) else f" of {', '.join(fields[:8])}{', ...' * (len(fields) > 8)}"
     known = list(PRESETS.get(getattr(models[0], "section", ""), {}))
     if value in known:
         return f'; a preset is taken by {{preset = "{value}"}}'
