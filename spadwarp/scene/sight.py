@@ -315,20 +315,6 @@ def _cut(triangles: Floats, plane: Floats) -> Floats:
     return np.concatenate(parts)
 
 
-def nearest_points(triangles: Floats, point: Floats) -> Floats:
-    """The point of each triangle that is nearest to a point, `[N, 3]`."""
-    corners = triangles - point
-    edges = np.roll(corners, -1, axis=1) - corners
-    along = -(corners * edges).sum(axis=2) / np.maximum((edges**2).sum(axis=2), 1e-300)
-    on_edges = corners + along.clip(0.0, 1.0)[..., None] * edges
-    nearest = (on_edges**2).sum(axis=2).argmin(axis=1)
-    normal = np.cross(edges[:, 0], edges[:, 1])
-    foot = normal * ((normal * corners[:, 0]).sum(axis=1) / np.maximum((normal**2).sum(axis=1), 1e-300))[:, None]
-    sides = (np.cross(edges, foot[:, None] - corners) * normal[:, None]).sum(axis=2)
-    within = (sides > 0.0).all(axis=1, keepdims=True)
-    return np.where(within, foot, on_edges[np.arange(len(nearest)), nearest]) + point
-
-
 def within_port(scene: Scene, triangles: Floats) -> tuple[str, str] | None:
     """What is in the housing or the window of the camera's port and is not meant for it, a laser that shines through no
     port, or parts of triangles: the field, and a text about it."""
@@ -350,7 +336,9 @@ def within_port(scene: Scene, triangles: Floats) -> tuple[str, str] | None:
         planes = np.vstack([view_planes(camera), [*(-np.array(port.normal)), port.nearest - 2e-6]])
         inside = points_inside(triangles, planes)
     else:
-        found = nearest_points(triangles, np.array(port.centre))
+        from trimesh.triangles import closest_point
+
+        found = closest_point(triangles, np.broadcast_to(port.centre, (len(triangles), 3)))
         outer = (port.radius + port.thickness) * (1.0 - 1e-6)
         inside = found[np.linalg.norm(found - port.centre, axis=1) < outer]
     if not len(inside):

@@ -24,7 +24,7 @@ from spadwarp.scene.laser import load_profile, profile_extent
 from spadwarp.scene.scan import shots_of
 from spadwarp.scene.scene import camera_port
 from spadwarp.scene.sections import field_range
-from spadwarp.scene.sight import nearest_points, view_planes
+from spadwarp.scene.sight import view_planes
 from spadwarp.transport.derivatives import resolve_derivatives
 from spadwarp.values import SEED, ConfigError, check_integer, check_part, check_real
 
@@ -372,13 +372,15 @@ def _lens_positions(scene: Scene) -> NDArray[np.float64]:
 
 def _distance(point: NDArray[np.float64], mesh: TriangleMesh) -> float:
     """From a point to the nearest face [m]."""
+    from trimesh.triangles import closest_point
+
     vertices, faces = mesh.vertices - point.astype(np.float32), mesh.faces
     nearest = (vertices**2).sum(axis=1).min()
     corners = [vertices[faces[:, k]] for k in range(3)]
     # The boxes about the faces leave few of them.
     box = np.maximum(np.minimum.reduce(corners), -np.maximum.reduce(corners)).clip(min=0.0)
     near = vertices[faces[(box**2).sum(axis=1) <= 1.001 * nearest]].astype(np.float64)
-    return float(np.linalg.norm(nearest_points(near, np.zeros(3)), axis=1).min())
+    return float(np.linalg.norm(closest_point(near, np.zeros((len(near), 3))), axis=1).min())
 
 
 def _spread(laser: Laser) -> float:
