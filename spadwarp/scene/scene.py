@@ -428,8 +428,12 @@ def mean_plane(scene: Scene, *, from_below: bool = False) -> PortGeometry:
 
 
 def _placed(scene: Scene, port: Port, origin: Any, normal: Any) -> PortGeometry:
+    """A port with its lengths from an origin, and its normal, in the frame of the camera."""
     water = scene.medium.phase_index, scene.medium.group_index
-    return port.placed(origin, normal, wavelength_nm=scene.laser.wavelength_nm, water=water)
+    index, group_index = zip(*port.indices(scene.laser.wavelength_nm), water, strict=True)
+    distance, radius = (port.distance or 0.0) + float(origin @ normal), port.radius or 0.0
+    ends = vector_of(normal), vector_of(origin + port.offset)
+    return PortGeometry(port.shape, distance, ends[0], radius, ends[1], port.thickness, index, group_index)
 
 
 # Scenes that move
