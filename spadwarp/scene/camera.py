@@ -109,7 +109,7 @@ class Camera(Section):
             yield f"focal_length is missing; {needs_it[0]} needs it"
         yield from self._only_with("fx", self.fx is not None, "fy", "cx", "cy")
         if self.focus_distance != "target" and self.focus_distance <= (self.focal_length or 0.0):
-            yield self._that("focus_distance", f"is outside ({self.focal_length}, inf], beyond the focal length")
+            yield self._that("focus_distance", f"is outside ({self.focal_length}, inf] m, beyond the focal length")
         if not is_invertible(self):
             size = f"{self.width} x {self.height}"
             yield self._that("distortion", f"is not one-to-one: some of its {size} pixels show no direction, or two")

@@ -65,7 +65,7 @@ class Flux(Section):
             yield "needs either voxels or positions"
         for k, (low, high, count) in enumerate(zip(self.lower, self.upper, self.voxels or (), strict=False)):
             if not low < high:
-                yield f"lower = {low} is outside (-inf, {high}), {high} being upper in {'xyz'[k]}"
+                yield f"lower = {low} is outside (-inf, {high}) m, {high} being upper in {'xyz'[k]}"
             if count > 1 and math.isinf(high - low):
                 yield f"voxels[{k}] = {count} needs lower and upper in {'xyz'[k]}"
         if self.gates > 1 and self.gate_width_ps is None:

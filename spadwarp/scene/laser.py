@@ -86,12 +86,12 @@ class Laser(Section):
 
     def _problems(self) -> Iterator[str]:
         if self.profile in ("gaussian", "measured") and self.half_angle_deg >= 90:
-            yield self._that("half_angle_deg", f"is outside (0, 90), the range of a {self.profile} profile")
+            yield self._that("half_angle_deg", f"is outside (0, 90) °, the range of a {self.profile} profile")
         if self.profile == "measured" and self.profile_image is None:
             yield "needs profile_image with profile = 'measured': the path of an image of the beam"
         yield from self._only_with("profile = 'measured'", self.profile == "measured", "profile_image")
         if self.linewidth_nm > (most := 0.2 * self.wavelength_nm):
-            reason = f"is outside [0, {most:g}], a fifth of wavelength_nm; a broader source needs spectrum"
+            reason = f"is outside [0, {most:g}] nm, a fifth of wavelength_nm; a broader source needs spectrum"
             yield self._that("linewidth_nm", reason)
         if self.spectrum is not None and self.linewidth_nm > 0.0:
             yield self._that("linewidth_nm", "cannot be combined with spectrum")

@@ -179,8 +179,7 @@ class Inelastic(Section):
         fluoresces = self.process == "fluorescence"
         if fluoresces and self.coefficient is None:
             yield "needs coefficient with process = 'fluorescence': absorption by chlorophyll times its quantum yield"
-        if not fluoresces and self.decay_time_ns > 0.0:
-            yield self._that("decay_time_ns", "goes with process = 'fluorescence' only")
+        yield from self._only_with("process = 'fluorescence'", fluoresces, "decay_time_ns")
 
     def in_waters(self, waters: Sequence[Medium | Layer], wavelength_nm: float) -> list[tuple[float, float, float]]:
         """Of the medium and its layers: `coefficient`, extinction and scattering [1/m].

@@ -49,10 +49,8 @@ class Waves(Section):
     heights: Annotated[str | None, FilePath(".npy")] = field(None, "heights [rows, columns] in place of a spectrum [m]")
 
     def _problems(self) -> Iterator[str]:
-        if self.heights is not None:
-            for name in ("cells", "fetch", "spreading", "shortest", "seed", "time"):
-                if getattr(self, name) != type(self).model_fields[name].default:
-                    yield f"{name} is of a spectrum, which heights takes the place of"
+        of_spectrum = "cells", "fetch", "spreading", "shortest", "seed", "time"
+        yield from self._only_with("a spectrum, in place of heights,", self.heights is None, *of_spectrum)
         if self.shortest is not None and self.shortest < 2.0 * self.size / self.cells:
             yield f"shortest = {self.shortest} m is less than two nodes, {2.0 * self.size / self.cells:.4g} m"
 
@@ -80,18 +78,12 @@ class Surface(Section):
             yield "needs either wind or mean_square_slope"
         yield from self._only_with("wind", self.wind is not None, "direction")
         yield from self._only_with("air_index", self.air_index is not None, "air_group_index")
-        if self.direction is not None:
-            cosine = np.dot(unit_vector(self.direction), unit_vector(self.up))
-            if abs(cosine) > 0.999:
-                yield self._that("direction", "is that of up: a wind blows along the sea")
-        if self.waves is not None:
-            yield from self._problems_of_waves(self.waves)
-
-    def _problems_of_waves(self, waves: Waves) -> Iterator[str]:
-        if waves.direction is not None:
-            cosine = np.dot(unit_vector(waves.direction), unit_vector(self.up))
-            if abs(cosine) > 0.999:
-                yield f"waves.direction = {waves.direction} is that of up: waves go along the sea"
+        waves = self.waves
+        for name, direction in (("direction", self.direction), ("waves.direction", waves and waves.direction)):
+            if direction is not None and abs(np.dot(unit_vector(direction), self.normal)) > 0.999:
+                yield f"{name} = {list(direction)} is that of up: wind and waves go along the sea"
+        if waves is None:
+            return
         if self.wind == 0.0 or self.mean_square_slope == 0.0:
             yield "waves need wind or mean_square_slope > 0"
         elif waves.heights is None and self.wind is None:

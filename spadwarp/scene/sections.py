@@ -50,7 +50,6 @@ Overrides = Mapping[str, Any] | Sequence[str]
 FileName = str | os.PathLike[str]
 
 _NUMBER = re.compile(r"\s*[+-]?\.?\d")
-_WITHOUT_UNIT = re.compile(r"^(\w+) = .*? is outside [\[(][^\])]*[\])](?=,|;|$)")
 
 
 class FilePath(NamedTuple):
@@ -277,20 +276,15 @@ class Section(_Model):
     @model_validator(mode="after")
     def _consistent(self) -> Self:
         for problem in self._problems():
-            raise ValueError(_WITHOUT_UNIT.sub(self._with_unit, problem))
+            raise ValueError(problem)
         return self
-
-    def _with_unit(self, found: re.Match[str]) -> str:
-        info = type(self).model_fields.get(found[1])
-        unit = None if info is None else field_unit(info)
-        return found[0] if unit in (None, "1") else f"{found[0]} {unit}"
 
     def _problems(self) -> Iterator[str]:
         """Why fields exclude each other; where they do not, sets what follows from those that were given."""
         yield from ()
 
     def _that(self, name: str, reason: str) -> str:
-        """A problem of a field: `half_angle_deg = 95.0 is outside (0, 90)`."""
+        """A problem of a field: `half_angle_deg = 95.0 is outside (0, 90) °`."""
         value = getattr(self, name)
         return f"{name} = {list(value) if isinstance(value, tuple) else value!r} {reason}"
 
@@ -354,16 +348,16 @@ def parts_of(annotation: Any) -> Iterator[Any]:
         yield from parts_of(part)
 
 
-def models_of(annotation: Any) -> list[type[BaseModel]]:
-    """Models of the tables that an annotation names."""
-    return [part for part in parts_of(annotation) if isinstance(part, type) and issubclass(part, BaseModel)]
+def table_in(annotation: Any) -> type[Section] | None:
+    """The model of the table, or of the tables of the list, that an annotation names."""
+    parts = parts_of(annotation)
+    return next((part for part in parts if isinstance(part, type) and issubclass(part, Section)), None)
 
 
 @cache
 def table_of(model: type[BaseModel], name: str) -> type[Section] | None:
-    """The model of a field's table, or of the tables of its list."""
-    info = model.model_fields.get(name)
-    return next((one for one in models_of(info) if issubclass(one, Section)), None)
+    """The same of a field."""
+    return table_in(model.model_fields.get(name))
 
 
 def field_unit(info: FieldInfo) -> str | None:
@@ -734,7 +728,7 @@ def locate(model: type[BaseModel], loc: Sequence[str | int]) -> tuple[Key, Field
         elif inner is not None and not part.startswith(("literal[", "function-")):
             key.append(part)
             info = inner.model_fields.get(part)
-            inner = next(iter(models_of(info)), None) if info is not None else None
+            inner = table_of(inner, part)
     return tuple(key), info
 
 
@@ -755,7 +749,7 @@ def _line(key: Key, info: FieldInfo | None, problem: Any, model: type[BaseModel]
     kind, value, whole = problem["type"], problem["input"], model
     if kind == "extra_forbidden":
         for part in (part for part in key[:-1] if isinstance(part, str)):
-            model = models_of(model.model_fields[part])[0]
+            model = table_of(model, part) or model
         word, siblings = str(key[-1]), list(model.model_fields)
         meant = _SYNONYMS.get(word)
         near = f"; did you mean {meant!r}?" if meant in siblings else suggestion(word, siblings)
@@ -827,13 +821,14 @@ def _instead(key: Key, info: FieldInfo | None, kind: str, value: Any) -> str:
         return f" of tables; write [[{key_text(key)}]]"
     if kind == "tuple_type" and isinstance(value, str) and not {float, int} & set(parts_of(info)):
         return f"; write [{value!r}]"
-    models = models_of(info) if kind.startswith("model") else []
-    if not models:
+    table = table_in(info) if kind.startswith("model") else None
+    if table is None:
         return _factor(key, value)
     if not isinstance(value, str):
-        fields, once = list(models[0].model_fields), f", of which there is one; write [{key_text(key)}]"
+        fields, once = list(table.model_fields), f", of which there is one; write [{key_text(key)}]"
         return once if isinstance(value, list | tuple) else f" of {', '.join(fields[:8])}{', ...' * (len(fields) > 8)}"
-    known = list(PRESETS.get(getattr(models[0], "section", ""), {}))
+    known = list(PRESETS.get(table.section, {}))
     if value in known:
         return f'; a preset is taken by {{preset = "{value}"}}'
-    return suggestion(value, known) or ("" if len(known) > 8 else f"; presets are {', '.join(map(repr, known))}")
+    listed = f"; presets are {', '.join(map(repr, known))}" if 0 < len(known) < 9 else ""
+    return suggestion(value, known) or listed

@@ -90,7 +90,7 @@ class Domain(Section):
     def _problems(self) -> Iterator[str]:
         for axis, low, high in zip("xyz", *self.bounds, strict=True):
             if not low < high:
-                yield f"lower = {low} is outside (-inf, {high}), {high} being upper in {axis}"
+                yield f"lower = {low} is outside (-inf, {high}) m, {high} being upper in {axis}"
         for name in self.reflecting:
             bound = self.bounds[name.endswith("high")]["xyz".index(name[0])]
             if math.isinf(bound):
