@@ -459,11 +459,13 @@ class Medium(PhaseLaw, Water):
 
     @property
     def phase_functions(self) -> list[PhaseFunction]:
-        """Those of the medium and, with constituents, of its layers and of those that cells have shares of. Raises what
-        `phase_function` raises."""
+        """Those of the medium; of layers and cells with an anisotropy of their own; with constituents, of layers and of
+        those that cells have shares of. Raises what `phase_function` and `grid_cells` raise."""
         layers = self.layers if self.phase_function == MIXTURE else ()
         of_cells = phase_function(self).constituents if self.grid is not None else ()
-        return [phase_function(self), *(phase_function(self, layer) for layer in layers), *of_cells]
+        own = () if self.has_phase_table else (PhaseLaw(anisotropy=g) for g in self.range.anisotropies)
+        laws = [*(phase_function(self, layer) for layer in layers), *(_law_of(law, "medium") for law in own)]
+        return [phase_function(self), *laws, *of_cells]
 
     @property
     def has_phase_table(self) -> bool:

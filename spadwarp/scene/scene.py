@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import contextlib
 import math
 import os
 from collections.abc import Iterator
@@ -18,7 +17,7 @@ from spadwarp.io.text import csv_lines, read_text, read_toml
 from spadwarp.scene.camera import Camera, to_camera, to_world
 from spadwarp.scene.flux import Flux, Sun
 from spadwarp.scene.laser import Laser, detection_efficiency, spectral_lines
-from spadwarp.scene.medium import Medium
+from spadwarp.scene.medium import Medium, phase_function
 from spadwarp.scene.port import Port, PortGeometry
 from spadwarp.scene.pose import rotation_angles, rotation_matrix, turned, unit_vector, vector_of
 from spadwarp.scene.sea import Surface
@@ -243,11 +242,10 @@ class Scene(Shown, Document):
             middle = 0.25 * self.medium.pulse_speed * (self.gate.start + self.gate.stop)
             distance = min(np.extract(np.isfinite(ranges), ranges), default=middle)
             directions /= math.sin(0.5 * math.atan2(self.camera.aperture_radius, distance)) ** 2
-        waters = [self.medium]
-        if self.medium.phase_function == "henyey_greenstein":
-            with contextlib.suppress(FileError):  # the file of the cells is gone
-                waters += [self.medium.model_copy(update={"anisotropy": g}) for g in self.medium.range.anisotropies]
-        laws = [law for water in waters for law in water.phase_functions]
+        try:
+            laws = self.medium.phase_functions
+        except FileError:  # the file of the cells is gone
+            laws = [phase_function(self.medium)]
         return max((law.unseen_share(directions) for law in laws), key=lambda found: found[1])
 
     def unseen_warning(self, photons: float, angle: float, unseen: float) -> str:

@@ -5,7 +5,6 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
-from functools import partial
 from pathlib import Path
 from typing import Any, Literal, NamedTuple
 
@@ -270,22 +269,16 @@ def tally_limits(scene: Scene, mesh: TriangleMesh | None) -> TallyLimits:
 Density = Callable[[NDArray[np.float64]], NDArray[np.float64]]
 
 
-def _own_anisotropies(scene: Scene) -> list[float]:
-    """Of layers and cells that share the phase function's form alone."""
-    return [] if scene.medium.has_phase_table else list(scene.medium.range.anisotropies)
-
-
 def _phase_density(scene: Scene) -> Density:
     """Largest density [1/sr] of the phase functions of a scene's waters over t = 1 - cos(angle) in (0, 2]."""
-    laws: list[Density] = [law.over_t for law in scene.medium.phase_functions]
-    laws += [partial(sk.henyey_greenstein_density, g=g) for g in _own_anisotropies(scene)]
-    return lambda t: np.max([law(t) for law in laws], axis=0)
+    laws = scene.medium.phase_functions
+    return lambda t: np.max([law.over_t(t) for law in laws], axis=0)
 
 
 def _backward(scene: Scene, density: Density) -> float:
     """Density [1/sr] with which light is thrown back: the largest of the phase function beyond 90°, or what many
     small deflections come to, isotropic scattering of (1 - <cos>) times the light."""
-    turned = 1.0 - min([*(law.mean_cosine for law in scene.medium.phase_functions), *_own_anisotropies(scene)])
+    turned = 1.0 - min(law.mean_cosine for law in scene.medium.phase_functions)
     return max(float(density(np.linspace(1.0, 2.0, 181)).max()), turned / (4.0 * math.pi))
 
 
