@@ -43,7 +43,7 @@ from spadwarp.result.tallies import (
 )
 from spadwarp.scene import Scene
 from spadwarp.scene.camera import camera_attributes, pixel_directions
-from spadwarp.scene.scan import shots_of
+from spadwarp.scene.scene import shots_of
 from spadwarp.values import ArgumentError, ConfigError, FileError, check_choice, check_integer, check_real, shown
 
 __all__ = ["ResultLike", "as_result", "load_result", "load_truth_exr", "load_truth_maps", "merge"]

@@ -19,8 +19,7 @@ from spadwarp.scene.camera import Camera, pixel_directions, to_camera, to_world
 from spadwarp.scene.laser import Laser, profile_axes, profile_extent
 from spadwarp.scene.port import PortGeometry
 from spadwarp.scene.pose import rotation_matrix, vector_of
-from spadwarp.scene.scan import shots_of
-from spadwarp.scene.scene import Scene, camera_port, laser_port
+from spadwarp.scene.scene import Scene, camera_port, laser_port, shots_of
 from spadwarp.scene.sea import Surface
 from spadwarp.values import path_from_time
 

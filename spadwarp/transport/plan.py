@@ -20,8 +20,7 @@ from spadwarp.result.tallies import count, shard_of
 from spadwarp.scene import Laser, Scene, Transport
 from spadwarp.scene.camera import to_camera
 from spadwarp.scene.laser import load_profile, profile_extent
-from spadwarp.scene.scan import shots_of
-from spadwarp.scene.scene import camera_port
+from spadwarp.scene.scene import camera_port, shots_of
 from spadwarp.scene.sections import field_range
 from spadwarp.scene.sight import view_planes
 from spadwarp.transport.derivatives import resolve_derivatives
