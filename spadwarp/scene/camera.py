@@ -19,15 +19,14 @@ import yaml
 from numpy.typing import ArrayLike, NDArray
 from pydantic import BeforeValidator, Field, model_validator
 
+from spadwarp.arrays import Floats
 from spadwarp.io.text import parse_json, read_text, write_text
 from spadwarp.scene.port import Port
 from spadwarp.scene.pose import rotation_matrix
-from spadwarp.scene.sections import AnyFile, Coordinate, Infinite, Section, Vector, Whole, field, field_range
+from spadwarp.scene.sections import Coordinate, File, Infinite, Section, Vector, Whole, field, field_range
 from spadwarp.values import ArgumentError, ConfigError, FileError, check_integer, read_real, shown
 
 __all__ = ["Camera", "load_calibration", "save_calibration"]
-
-Points = NDArray[np.float64]
 
 _INTRINSICS = ("fx", "fy", "cx", "cy", "calibration")
 
@@ -68,7 +67,7 @@ class Camera(Section):
     cx: Coordinate | None = field(None, "column of the optical axis, 0 at the first pixel's centre; default: middle")
     cy: Coordinate | None = field(None, "row of the optical axis, likewise")
     distortion: Brown = field((0.0,) * 5, "Brown's lens distortion k1, k2, p1, p2, k3, OpenCV's order")
-    calibration: AnyFile = field(None, "OpenCV's YAML or JSON file, whose fx, fy, cx, cy and distortion take its place")
+    calibration: File = field(None, "OpenCV's YAML or JSON file, whose fx, fy, cx, cy and distortion take its place")
     aperture_diameter: float | None = field(None, "diameter of the entrance aperture [m]", "[1e-9, 1e6]")
     f_number: float | None = field(None, "focal length over aperture diameter", "[0.001, 1e6]")
     focus_distance: Annotated[
@@ -201,12 +200,12 @@ class Camera(Section):
         return math.pi * self.aperture_radius**2
 
 
-def to_camera(camera: Camera, points: ArrayLike) -> Points:
+def to_camera(camera: Camera, points: ArrayLike) -> Floats:
     """Points of the world `[..., 3]` [m] in the camera's frame."""
     return (np.asarray(points, np.float64) - camera.position) @ rotation_matrix(camera.rotation_deg)
 
 
-def to_world(camera: Camera, points: ArrayLike) -> Points:
+def to_world(camera: Camera, points: ArrayLike) -> Floats:
     """Points of the camera's frame `[..., 3]` [m] in the world."""
     return np.asarray(points, np.float64) @ rotation_matrix(camera.rotation_deg).T + camera.position
 
@@ -218,13 +217,13 @@ def to_world(camera: Camera, points: ArrayLike) -> Points:
 _MARGIN = 0.01
 
 
-def image_points(camera: Camera, tangents: ArrayLike) -> Points:
+def image_points(camera: Camera, tangents: ArrayLike) -> Floats:
     """Image coordinates at which directions with the given tangents are seen, `[..., 2]`."""
     seen, _ = _distort(np.asarray(tangents, np.float64), camera.distortion)
     return seen * camera.focal_pixels + camera.principal_point
 
 
-def image_tangents(camera: Camera, points: ArrayLike) -> Points:
+def image_tangents(camera: Camera, points: ArrayLike) -> Floats:
     """Tangents of the directions that are seen at image coordinates, `[..., 2]`: `image_points` undone, by Newton's
     method; NaN where no direction is seen."""
     seen = (np.asarray(points, np.float64) - camera.principal_point) / camera.focal_pixels
@@ -244,7 +243,7 @@ def image_tangents(camera: Camera, points: ArrayLike) -> Points:
     return tangents
 
 
-def pixel_directions(camera: Camera) -> Points:
+def pixel_directions(camera: Camera) -> Floats:
     """Unit vectors from the lens centre through the pixel centres, float64 `[H, W, 3]`."""
     centres = np.stack(np.meshgrid(np.arange(camera.width) + 0.5, np.arange(camera.height) + 0.5), axis=-1)
     rays = np.concatenate([image_tangents(camera, centres), np.ones((camera.height, camera.width, 1))], axis=-1)
@@ -276,13 +275,13 @@ def view_box(camera: Camera) -> tuple[float, float, float, float]:
     return left, top, right, bottom
 
 
-def pixel_views(camera: Camera) -> Points:
+def pixel_views(camera: Camera) -> Floats:
     """As `view_box` for each pixel alone: `[H, W, 4]`."""
     corners = image_tangents(camera, _grid(np.arange(camera.width + 1.0), np.arange(camera.height + 1.0)))
     return _boxes(camera, np.stack([corners[:-1, :-1], corners[:-1, 1:], corners[1:, :-1], corners[1:, 1:]]))
 
 
-def _boxes(camera: Camera, tangents: Points) -> Points:
+def _boxes(camera: Camera, tangents: Floats) -> Floats:
     """Boxes `[..., 4]` that hold tangents `[N, ..., 2]`."""
     margin = _MARGIN / np.array(camera.focal_pixels)
     return np.concatenate([tangents.min(axis=0) - margin, tangents.max(axis=0) + margin], axis=-1)
@@ -304,12 +303,12 @@ def camera_attributes(camera: Camera, focus_distance: float | None) -> dict[str,
     }
 
 
-def _grid(columns: Points, rows: Points) -> Points:
+def _grid(columns: Floats, rows: Floats) -> Floats:
     """`[R, C, 2]`."""
     return np.stack(np.meshgrid(columns, rows), axis=-1)
 
 
-def _distort(tangents: Points, coefficients: tuple[float, ...]) -> tuple[Points, tuple[Points, Points, Points]]:
+def _distort(tangents: Floats, coefficients: tuple[float, ...]) -> tuple[Floats, tuple[Floats, Floats, Floats]]:
     """Brown's model (1966) in OpenCV's order k1, k2, p1, p2, k3; and its derivatives: of x by x, of x by y and of y by
     x, which are the same, of y by y."""
     k1, k2, p1, p2, k3 = coefficients

@@ -17,7 +17,7 @@ from spadwarp.io.arrays import read_npz
 from spadwarp.io.hdf5 import read_hdf5
 from spadwarp.io.paths import existing_file
 from spadwarp.scene.pose import rotation_matrix, vector_of
-from spadwarp.scene.sections import AnyFile, Counts, Scale, Section, Size, Vector, Whole, field, field_range, file_of
+from spadwarp.scene.sections import Counts, File, Scale, Section, Size, Vector, Whole, field, field_range, file_of
 from spadwarp.values import ConfigError, FileError, Interval, SpadwarpError
 
 COEFFICIENTS = ("absorption", "scattering", "extinction", "albedo")
@@ -43,7 +43,7 @@ class Grid(Section):
     """
 
     displaces: ClassVar = {"file": ("shape", *_OF_SHAPES), "shape": ("file",)}
-    file: AnyFile = field(None, "path of a .npz, .h5 or .nvdb file with cells, relative to the scene file")
+    file: File = field(None, "path of a .npz, .h5 or .nvdb file with cells, relative to the scene file")
     shape: Literal["cloud", "plume", "sediment", "gradient"] | None = None
     """in place of a file: a round cloud, a plume that rises, matter stirred up from the bottom, a rise from top to
     bottom; the box's y points down"""
@@ -97,11 +97,9 @@ class Grid(Section):
     @property
     def cell_counts(self) -> tuple[int, int, int]:
         """`cells` as three numbers: with one, cells are about as long as wide."""
-        if len(self.cells) == 3:
-            x, y, z = self.cells
-            return x, y, z
         edges = self.edges or (1.0, 1.0, 1.0)
-        x, y, z = (max(1, round(self.cells[0] * edge / max(edges))) for edge in edges)
+        even = (max(1, round(self.cells[0] * edge / max(edges))) for edge in edges)
+        x, y, z = self.cells if len(self.cells) == 3 else even
         return x, y, z
 
     def to_dict(self) -> dict[str, Any]:
@@ -173,16 +171,14 @@ GRID_ARRAYS = {
 """Arrays of a file `[x, y, z]`, or of several frames `[frame, x, y, z]`, and their ranges."""
 _PLACES = {"size": "(0, inf)", "cell_size": "(0, inf)", "origin": "(-inf, inf)"}
 
-Place = tuple[float, float, float]
-
 
 class GridFile(NamedTuple):
     """Cells of a file: arrays by the names of `GRID_ARRAYS`, `[frame, x, y, z]` float32; edges of the box [m], None if
     the scene has to say; its lower corner in the file's own frame [m], None if it stands about its middle."""
 
     arrays: Mapping[str, NDArray[np.float32]]
-    size: Place | None = None
-    origin: Place | None = None
+    size: Vector | None = None
+    origin: Vector | None = None
 
 
 def read_grid(path: str | Path) -> GridFile:
@@ -294,8 +290,8 @@ class GridCells:
     extinction: NDArray[np.float32]  # c [1/m], `[x, y, z]` along the box's own axes
     albedo: NDArray[np.float32]  # b/c
     anisotropy: NDArray[np.float32] | None  # g; None: the medium's everywhere
-    size: Place  # edges of the box [m]
-    centre: Place  # its middle in the world [m]
+    size: Vector  # edges of the box [m]
+    centre: Vector  # its middle in the world [m]
     rotation: Floats  # its own axes in the world, as columns
 
     @property

@@ -21,17 +21,7 @@ from spadwarp.io.arrays import read_exr, read_npy
 from spadwarp.io.paths import existing_file, reading
 from spadwarp.scene.port import Port
 from spadwarp.scene.pose import unit_vector
-from spadwarp.scene.sections import (
-    AnyFile,
-    CsvFile,
-    Direction,
-    Section,
-    Vector,
-    field,
-    field_range,
-    file_of,
-    read_table,
-)
+from spadwarp.scene.sections import CsvFile, Direction, File, Section, Vector, field, field_range, file_of, read_table
 from spadwarp.scene.settings import Detector
 from spadwarp.values import PLANCK, SPEED_OF_LIGHT, ConfigError, FileError, Interval
 from spadwarp.water.seawater import RANGES
@@ -62,7 +52,7 @@ class Laser(Section):
     """what it shines through: a port of its own, whose lengths start at `position`, or that of the camera"""
     profile: Literal["uniform_cone", "gaussian", "collimated", "measured"] = "uniform_cone"
     """even over a cone; exp(-2 tan²α/tan²θ); parallel; or an image"""
-    profile_image: AnyFile = field(None, "irradiance across a measured beam: .npy, .exr, .png (linear), rows downwards")
+    profile_image: File = field(None, "irradiance across a measured beam: .npy, .exr, .png (linear), rows downwards")
     half_angle_deg: float = field(15.0, "θ of the cone, 1/e² of the gaussian, half the image [°]", "[1e-6, 180]")
     beam_radius: float = field(0.0, "radius of the collimated beam [m]; 0 is a pencil beam", "[0, 1e6]")
     wavelength_nm: float = field(532.0, "in vacuum [nm]; with a spectrum that of photons and water", "[1e-9, 1e6]")

@@ -374,7 +374,7 @@ class Medium(PhaseLaw, Water):
             yield f"grid.constituent = {self.grid.constituent!r} is not one of {', '.join(names)}"
         for i, water in enumerate(self.waters, -1):
             place = "" if water is self else f"layers[{i}]."
-            if (c := self._sum(water)[2]) not in (allowed := field_range(type(self), "extinction")):
+            if (c := self._mixed(water)["extinction"]) not in (allowed := field_range(type(self), "extinction")):
                 yield f"{place}extinction = {c} of the constituents is outside {allowed}"
 
     def concentrations_in(self, water: Medium | Layer) -> list[float]:
@@ -391,11 +391,11 @@ class Medium(PhaseLaw, Water):
         whole = math.fsum(parts := self.scattering_in(water))
         return [part / whole if whole > 0.0 else 1.0 / len(parts) for part in parts]
 
-    def _sum(self, water: Medium | Layer) -> tuple[float, float, float]:
-        """a, b and c of the medium or a layer from constituents [1/m]."""
+    def _mixed(self, water: Medium | Layer) -> dict[str, float]:
+        """Coefficients of the medium or a layer from constituents [1/m]."""
         numbers, b = self.concentrations_in(water), math.fsum(self.scattering_in(water))
         a = math.fsum(n * one.absorption for n, one in zip(numbers, self.constituents, strict=True))
-        return a, b, a + b
+        return {"absorption": a, "scattering": b, "extinction": a + b}
 
     def _follow(self, wavelength_nm: float) -> None:
         """Sets what depends on the wavelength."""
@@ -405,9 +405,8 @@ class Medium(PhaseLaw, Water):
             own = {name: getattr(one, name) for name in _LAW_FIELDS}
             self.__dict__.update(own if len(self.constituents) == 1 else {"phase_function": MIXTURE})
             for water in self.waters:
-                a, b, c = self._sum(water)
-                pair = {"absorption": a, "scattering": b, "extinction": c, "albedo": b / c}
-                water.__dict__.update(pair)
+                mixed = self._mixed(water)
+                water.__dict__.update(mixed, albedo=mixed["scattering"] / mixed["extinction"])
         for water in self.waters:
             names = [] if water.chlorophyll is None else [*COEFFICIENTS]
             if water is self and self.follows_wavelength:

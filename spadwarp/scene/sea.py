@@ -31,7 +31,6 @@ _NODES_OF_A_WAVE = 4.0
 class Waves(Section):
     """Resolved waves: a periodic field of heights, drawn from a spectrum or read from a file."""
 
-    section: ClassVar[str] = "surface.waves"
     size: float = field(
         20.0, "period of the field along the waves, and across them unless heights has it [m]", "[0.1, 1e5]"
     )
@@ -79,7 +78,8 @@ class Surface(Section):
         yield from self._only_with("wind", self.wind is not None, "direction")
         yield from self._only_with("air_index", self.air_index is not None, "air_group_index")
         waves = self.waves
-        for name, direction in (("direction", self.direction), ("waves.direction", waves and waves.direction)):
+        ways = {"direction": self.direction, "waves.direction": None if waves is None else waves.direction}
+        for name, direction in ways.items():
             if direction is not None and abs(np.dot(unit_vector(direction), self.normal)) > 0.999:
                 yield f"{name} = {list(direction)} is that of up: wind and waves go along the sea"
         if waves is None:

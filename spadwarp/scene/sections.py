@@ -100,7 +100,7 @@ Scale = Annotated[tuple[Coordinate, Coordinate, Coordinate], from_one(3)]
 _UP_TO_THREE = from_one(1), Field(min_length=1, max_length=3)
 Size = Annotated[tuple[Annotated[float, Field(ge=1e-9, le=1e9)], ...], *_UP_TO_THREE]
 Counts = Annotated[tuple[Annotated[int, Field(ge=1, le=1024)], ...], *_UP_TO_THREE]
-AnyFile = Annotated[str | None, FilePath()]
+File = Annotated[str | None, FilePath()]
 CsvFile = Annotated[str | None, FilePath(".csv")]
 
 
