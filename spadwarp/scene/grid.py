@@ -52,9 +52,8 @@ class Grid(Section):
     extinction: float = field(1.0, "what density 1 adds to the medium's extinction [1/m]", "[0, 1e6]")
     albedo: float = field(0.8, "single-scattering albedo of what is added", "[0, 1]")
     anisotropy: float | None = field(None, "henyey_greenstein: g of what is added; default: the medium's", "(-1, 1)")
-    constituent: str | None = field(
-        None, "the medium's constituent of which density is so much more than the medium has"
-    )
+    constituent: str | None = None
+    """the medium's constituent of which density is so much more than the medium has"""
     turbulence: float = Field(0.0, ge=0, le=3)
     """shape: standard deviation of the logarithm of the density about the shape, by eddies of von Kármán's spectrum"""
     eddy_size: float | None = Field(None, ge=1e-6, le=1e9)

@@ -31,15 +31,13 @@ _NODES_OF_A_WAVE = 4.0
 class Waves(Section):
     """Resolved waves: a periodic field of heights, drawn from a spectrum or read from a file."""
 
-    size: float = field(
-        20.0, "period of the field along the waves, and across them unless heights has it [m]", "[0.1, 1e5]"
-    )
+    size: float = Field(20.0, ge=0.1, le=1e5)
+    """period of the field along the waves, and across them unless heights has it [m]"""
     cells: Whole = field(512, "nodes of the field along each side, for a spectrum", "[8, 8192]")
     spectrum: Literal["jonswap"] = field("jonswap", "of the waves that surface.wind makes (Hasselmann et al. 1973)")
     fetch: float = field(10e3, "length of sea over which the wind blows [m]", "[10, 1e7]")
-    spreading: float = field(
-        10.0, "s of the distribution cos^2s(θ/2) of directions; large: one direction", "[0.5, 200]"
-    )
+    spreading: float = Field(10.0, ge=0.5, le=200)
+    """s of the distribution cos^2s(θ/2) of directions; large: one direction"""
     direction: Direction | None = field(None, "in which the waves go, in the world; default: surface.direction, or any")
     shortest: float | None = Field(None, ge=1e-3, le=1e4)
     """length of the shortest waves [m]; default: four nodes, or more until facets keep a quarter of the slopes"""

@@ -110,10 +110,7 @@ class LinesOfSight:
 
     def depth_from_range(self, distance: Any) -> Any:
         """Depth z [m]."""
-        depth = self.start[..., 2] + (distance - self.lead) * self.direction[..., 2]
-        if self.open:
-            depth = np.where(distance < self.lead, distance / self.lead * self.start[..., 2], depth)
-        return depth
+        return self.points(distance)[..., 2]
 
     def range_from_depth(self, depth: Any) -> Any:
         """Range [m] at planar depths."""
