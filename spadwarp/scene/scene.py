@@ -7,7 +7,7 @@ import os
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Literal, NamedTuple, get_args
+from typing import Any, Literal, get_args
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -25,7 +25,7 @@ from spadwarp.scene.sea import Surface
 from spadwarp.scene.sections import Document, Overrides
 from spadwarp.values import ArgumentError, ConfigError, FileError, Shown, check_integer, check_real, read_real, shown
 
-__all__ = ["Scene", "SceneLike", "Shots", "Trajectory", "WaterLine", "as_scene", "load_scene", "load_trajectory"]
+__all__ = ["Scene", "SceneLike", "Shots", "Trajectory", "as_scene", "load_scene", "load_trajectory"]
 __all__ += ["shot_at", "shot_scene", "shots_of", "template", "water_lines"]
 
 # What the light has met.
@@ -364,30 +364,20 @@ def template() -> str:
     return read_text(Path(__file__).with_name("template.toml"))
 
 
-class WaterLine(NamedTuple):
-    """A line of the light that passes the filter, in the water."""
-
-    share: float  # photons, over those of a pulse of one line at `laser.wavelength_nm`
-    extinction: float  # [1/m]
-    scattering: float  # [1/m]
-    speed: float  # of a pulse [m/s]
-
-
-def water_lines(scene: Scene) -> list[WaterLine]:
-    """Lines of a pulse that pass the filter; one line where nothing of the water follows the wavelength.
+def water_lines(scene: Scene) -> list[tuple[float, Medium]]:
+    """Lines of a pulse that pass the filter: their photons, over those of a pulse of one line at `laser.wavelength_nm`,
+    and the medium as they meet it; one line where nothing of the water follows the wavelength.
 
     Raises `FileError` or `ConfigError` for a table, and `ConfigError` for a spectrum beyond where the water is known.
     """
     medium, lines = scene.medium, spectral_lines(scene.laser, scene.detector)
     if len(lines) == 1 or not medium.follows_wavelength:
-        whole = math.fsum(line.share for line in lines)
-        return [WaterLine(whole, medium.extinction, medium.scattering, medium.pulse_speed)]
+        return [(math.fsum(line.share for line in lines), medium)]
     try:
-        waters = [(line.share, medium.at_wavelength(line.wavelength_nm)) for line in lines]
+        return [(line.share, medium.at_wavelength(line.wavelength_nm)) for line in lines]
     except ArgumentError as error:
         text = "laser: the spectrum reaches beyond where medium.chlorophyll, temperature and salinity hold"
         raise ConfigError(f"{text}: {error}", source=scene.source) from None
-    return [WaterLine(share, water.extinction, water.scattering, water.pulse_speed) for share, water in waters]
 
 
 def camera_port(scene: Scene) -> PortGeometry | None:

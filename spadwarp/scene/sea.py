@@ -67,8 +67,7 @@ class Surface(Section):
     air_index: float | None = field(None, "phase index of the air; default: that of dry air", "[1, 1.2]")
     air_group_index: float | None = field(None, "group index of the air; default: dry air's, or air_index", "[1, 1.2]")
     air_extinction: float = field(0.0, "of the air, whose scattered light is lost [1/m]", "[0, 100]")
-    waves: Waves | None = None
-    """resolved waves; facets are about those then, with the slopes that they leave"""
+    waves: Waves | None = field(None, "resolved waves; facets are about those then, with the slopes that they leave")
 
     def _problems(self) -> Iterator[str]:
         if (self.wind is None) == (self.mean_square_slope is None):
