@@ -557,7 +557,7 @@ def with_gate(scene: Scene, span: tuple[float, float], margin: float) -> Scene:
 
     The bins keep their width. Raises `ConfigError` for a gate of more than a million bins.
     """
-    lines, index = lines_of_sight(scene).flat(), scene.medium.group_index
+    lines, index = lines_of_sight(scene), scene.medium.group_index
     # A pixel whose light does not get through the port has no time; one that is still in the port has that of its end.
     times = [time_from_path(lines.path_from_range(np.maximum(r, lines.lead + _LEAST)), index) for r in span]
     spread, width = time_from_range(margin, index), scene.gate.bin_width

@@ -120,11 +120,6 @@ class Camera(Section):
         return {"none": (), "analyser": ("co", "cross"), "stokes": ("I", "Q", "U", "V")}[self.polarisation]
 
     @property
-    def tallied_channels(self) -> tuple[str, ...]:
-        """Channels with tallies of their own: all but the intensity, which is the histogram."""
-        return tuple(name for name in self.channels if name != "I")
-
-    @property
     def focal_pixels(self) -> tuple[float, float]:
         """Focal length in pixels along rows and columns, fx and fy: image distance over pixel pitch."""
         if self.fx is not None:

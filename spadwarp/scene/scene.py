@@ -279,9 +279,11 @@ class Scene(Shown, Document):
 
     @property
     def tallied_channels(self) -> tuple[str, ...]:
-        """Channels with tallies of their own: of polarised light, or of light at other wavelengths."""
+        """Channels with tallies of their own: of polarised light, but for its intensity, which is the histogram, or of
+        light at other wavelengths."""
+        own = (name for name in self.camera.channels if name != "I")
         others = (one.process for one in self.medium.inelastic)
-        return (*self.camera.tallied_channels, *others, *(f"line {k + 1}" for k in range(len(self.medium.beside))))
+        return (*own, *others, *(f"line {k + 1}" for k in range(len(self.medium.beside))))
 
     @property
     def polarised(self) -> bool:

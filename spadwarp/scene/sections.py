@@ -368,12 +368,6 @@ def field_unit(info: FieldInfo) -> str | None:
     return next((unit for unit in bracketed if unit in UNITS), None if bracketed else "1")
 
 
-def takes_integers(info: FieldInfo) -> bool:
-    """Whether a field's numbers are whole."""
-    parts = list(parts_of(info))
-    return any(part is int for part in parts) and not any(part is float for part in parts)
-
-
 def in_field_unit(value: Any, info: FieldInfo) -> Any:
     """A text, or those of a list or table, as numbers of the field's unit; NumPy's values as Python's; others stay.
 

@@ -89,10 +89,6 @@ class LinesOfSight:
         pose = None if self.pose is None else (self.pose[0][index], self.pose[1][index])
         return LinesOfSight(*lines, self.laser, self.laser_port, pose, self.open)
 
-    def flat(self) -> LinesOfSight:
-        """The lines of all pixels in one row, `[P, 3]`."""
-        return self[np.unravel_index(np.arange(self.lead.size), self.lead.shape)]
-
     def points(self, distance: ArrayLike) -> Floats:
         """Points in the camera frame at ranges [m]."""
         distance = np.asarray(distance, np.float64)
