@@ -365,39 +365,30 @@ def save_calibration(camera: Camera, path: str | Path) -> Path:
         raise ArgumentError(f"{path}: ending {path.suffix!r} is not one of {', '.join(CALIBRATION_ENDINGS)}")
     numbers: Any = camera_attributes(camera, None)
     entries: dict[str, Any] = {"image_width": camera.width, "image_height": camera.height}
-    for name, rows, values in (
-        ("camera_matrix", 3, "camera_matrix"),
-        ("distortion_coefficients", 1, "camera_distortion"),
-    ):
-        data = numbers[values].tolist()
+    for name, rows, values in (("camera_matrix", 3, "matrix"), ("distortion_coefficients", 1, "distortion")):
+        data = numbers[f"camera_{values}"].tolist()
         entries[name] = {"type_id": "opencv-matrix", "rows": rows, "cols": len(data) // rows, "dt": "d", "data": data}
     if ending == ".json":
         return write_text(json.dumps(entries, indent=1) + "\n", path)
-    write = _xml_lines if ending == ".xml" else _yaml_lines
-    return write_text("\n".join([*write(entries), ""]), path)
+    return write_text("\n".join([*_lines(entries, ending == ".xml"), ""]), path)
 
 
-def _xml_lines(entries: Mapping[str, Any]) -> Iterator[str]:
-    yield from ('<?xml version="1.0"?>', "<opencv_storage>")
+def _lines(entries: Mapping[str, Any], xml: bool) -> Iterator[str]:
+    """Lines of the entries in XML or YAML."""
+    yield from ('<?xml version="1.0"?>', "<opencv_storage>") if xml else ("%YAML:1.0", "---")
     for name, value in entries.items():
         if not isinstance(value, Mapping):
-            yield f"<{name}>{value}</{name}>"
+            yield f"<{name}>{value}</{name}>" if xml else f"{name}: {value}"
             continue
-        yield f'<{name} type_id="opencv-matrix">'
+        yield f'<{name} type_id="opencv-matrix">' if xml else f"{name}: !!opencv-matrix"
+        numbers = map(repr, value["data"])
+        parts = {**value, "data": " ".join(numbers) if xml else f"[ {', '.join(numbers)} ]"}
         for key in ("rows", "cols", "dt", "data"):
-            text = " ".join(map(repr, value[key])) if key == "data" else value[key]
-            yield f"  <{key}>{text}</{key}>"
-        yield f"</{name}>"
-    yield "</opencv_storage>"
-
-
-def _yaml_lines(entries: Mapping[str, Any]) -> Iterator[str]:
-    yield from ("%YAML:1.0", "---")
-    for name, value in entries.items():
-        yield f"{name}: {'!!opencv-matrix' if isinstance(value, Mapping) else value}"
-        if isinstance(value, Mapping):
-            yield from (f"   {key}: {value[key]}" for key in ("rows", "cols", "dt"))
-            yield f"   data: [ {', '.join(map(repr, value['data']))} ]"
+            yield f"  <{key}>{parts[key]}</{key}>" if xml else f"   {key}: {parts[key]}"
+        if xml:
+            yield f"</{name}>"
+    if xml:
+        yield "</opencv_storage>"
 
 
 def _entries(text: str) -> dict[str, Any]:
