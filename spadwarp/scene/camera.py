@@ -393,8 +393,7 @@ def _lines(entries: Mapping[str, Any], xml: bool) -> Iterator[str]:
 
 def _entries(text: str) -> dict[str, Any]:
     """Names and values of a file in XML, JSON or YAML. Raises `ValueError`."""
-    start = text.lstrip()[:1]
-    kind = {"<": "XML", "{": "JSON"}.get(start, "YAML")
+    kind = {"<": "XML", "{": "JSON"}.get(text.lstrip()[:1], "YAML")
     try:  # OpenCV's first line is no YAML
         if kind == "XML":
             return _xml_entries(text)

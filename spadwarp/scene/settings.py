@@ -326,12 +326,10 @@ class Flux(Section):
             yield self._that("gates", "needs gate_width_ps")
         if any(a >= b for a, b in zip(self.positions or (), (self.positions or ())[1:], strict=False)):
             yield "positions do not rise"
-        yield from self._only_with(
-            "voxels", self.voxels is not None, "lower", "upper", "gates", "gate_start_ns", "gate_width_ps", "estimator"
-        )
-        yield from self._only_with(
-            "positions", self.positions is not None, "axis", "radius", "centre", "polar_bins", "azimuth_bins"
-        )
+        of_voxels = "lower", "upper", "gates", "gate_start_ns", "gate_width_ps", "estimator"
+        yield from self._only_with("voxels", self.voxels is not None, *of_voxels)
+        of_planes = "axis", "radius", "centre", "polar_bins", "azimuth_bins"
+        yield from self._only_with("positions", self.positions is not None, *of_planes)
 
     @property
     def kind(self) -> str:
@@ -390,7 +388,8 @@ class Flux(Section):
         if not self.polar_bins:
             return {"irradiance": found}
         polar, azimuth = (
-            np.linspace(0.0, end, n + 1) for end, n in ((np.pi, self.polar_bins), (2 * np.pi, self.azimuth_bins))
+            np.linspace(0.0, np.pi, self.polar_bins + 1),
+            np.linspace(0.0, 2 * np.pi, self.azimuth_bins + 1),
         )
         bins: dict[str, Coordinate] = {
             "polar": (0.5 * (polar[1:] + polar[:-1]), "rad", "angle between ray and axis, middle of a bin"),
