@@ -387,10 +387,8 @@ class Flux(Section):
         found = FluxArray(entries, columns, {**rows, "kind": kinds}, area_unit, text, np.array(unit / area))
         if not self.polar_bins:
             return {"irradiance": found}
-        polar, azimuth = (
-            np.linspace(0.0, np.pi, self.polar_bins + 1),
-            np.linspace(0.0, 2 * np.pi, self.azimuth_bins + 1),
-        )
+        polar = np.linspace(0.0, np.pi, self.polar_bins + 1)
+        azimuth = np.linspace(0.0, 2 * np.pi, self.azimuth_bins + 1)
         bins: dict[str, Coordinate] = {
             "polar": (0.5 * (polar[1:] + polar[:-1]), "rad", "angle between ray and axis, middle of a bin"),
             "azimuth": (0.5 * (azimuth[1:] + azimuth[:-1]), "rad", "about the axis, middle of a bin"),
