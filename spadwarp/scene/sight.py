@@ -29,14 +29,6 @@ _STEPS = 30
 _GAUSSIAN_EDGE = 1.5  # tan of the outermost angle over tan θ: holds 98.9 % of a gaussian beam
 
 
-def view_directions(scene: Scene) -> Floats:
-    """As `pixel_directions` of a scene's camera; of a scan along a trajectory in the frame of each shot."""
-    if scene.scan.mode != "trajectory":
-        return pixel_directions(scene.camera)
-    size = (scene.camera.height, scene.camera.width, 3)
-    return np.broadcast_to(pixel_directions(scene.receiver), size)
-
-
 def scan_axes(scene: Scene) -> Floats:
     """Axis of the beam of a confocal scan at each pixel, unit vectors in the camera frame, float64 `[H, W, 3]`.
 
@@ -187,7 +179,8 @@ def lines_of_sight(scene: Scene, view: Floats | None = None) -> LinesOfSight:
         shots = shots_of(scene)
         axes = (rotation_matrix(scene.camera.rotation_deg).T @ shots.rotation)[shots.number]
         pose = axes, to_camera(scene.camera, shots.position)[shots.number]
-    view = view_directions(scene) if view is None else view
+    if view is None:  # of a scan along a trajectory in the frame of each shot
+        view = np.broadcast_to(pixel_directions(scene.receiver), (scene.camera.height, scene.camera.width, 3))
     if port is None:
         lines = _in_water(view)
     elif pose is None:
