@@ -20,18 +20,10 @@ from spadwarp.device import pick_devices
 from spadwarp.frames import detector_response
 from spadwarp.mesh import TriangleMesh, build_mesh, focus_distance, guess_unit
 from spadwarp.mesh.targets import target_balls
-from spadwarp.scene import Scene, SceneLike, as_scene, daylight_rate, shot_at, shots_of
+from spadwarp.scene import Scene, SceneLike, as_scene, daylight_rate, phase_function, shot_at, shots_of
 from spadwarp.scene.camera import image_points, to_camera, to_world
 from spadwarp.scene.laser import Laser, profile_extent, spectral_lines
-from spadwarp.scene.medium import (
-    NOTABLE_UNSEEN,
-    WATER_INDICES,
-    Water,
-    grid_cells,
-    natural_laws,
-    phase_function,
-    scattering_matrix,
-)
+from spadwarp.scene.medium import NOTABLE_UNSEEN, WATER_INDICES, Water, grid_cells, natural_laws, scattering_matrix
 from spadwarp.scene.port import Port
 from spadwarp.scene.scene import camera_port, laser_port, water_lines
 from spadwarp.scene.sections import interval_of

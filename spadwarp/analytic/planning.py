@@ -30,8 +30,7 @@ from spadwarp.analytic.pilot import (
     typical_pixels,
     window,
 )
-from spadwarp.frames import detector_response
-from spadwarp.frames.depth import METHODS, Method
+from spadwarp.frames import METHODS, Method, detector_response
 from spadwarp.result import CHANNELS, POLARISED, Channel, Result
 from spadwarp.scene import Scene, SceneLike, Transport, as_scene
 from spadwarp.scene.camera import to_world
