@@ -96,7 +96,7 @@ Direction = Annotated[Vector, AfterValidator(_with_length)]
 Infinite = BeforeValidator(lambda value: math.inf if value == "infinity" else value)
 Bound = Annotated[float, Field(ge=-math.inf, le=math.inf, allow_inf_nan=True)]
 Corner = Annotated[tuple[Bound, Bound, Bound], from_one(3)]
-Scale = Annotated[tuple[Coordinate, Coordinate, Coordinate], from_one(3)]
+Scale = Annotated[Vector, from_one(3)]
 _UP_TO_THREE = from_one(1), Field(min_length=1, max_length=3)
 Size = Annotated[tuple[Annotated[float, Field(ge=1e-9, le=1e9)], ...], *_UP_TO_THREE]
 Counts = Annotated[tuple[Annotated[int, Field(ge=1, le=1024)], ...], *_UP_TO_THREE]
