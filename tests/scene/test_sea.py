@@ -34,7 +34,7 @@ BOTTOM = {"builtin": "plane", "size": [40.0, 40.0], "translation": [0.0, 0.0, 8.
         ({"surface": {**BAY["surface"], "waves": {"shortest": 0.01}}}, "shortest = 0.01 m is less than two nodes"),
         (
             {"surface": {**BAY["surface"], "waves": {"heights": "a.npy", "seed": 2}}},
-            "seed = 2 goes with a spectrum, in place of heights, only",
+            "seed = 2 goes with a spectrum, in",
         ),
         ({"surface": {**BAY["surface"], "wind": None, "mean_square_slope": 0.02, "waves": {}}}, "spectrum needs wind"),
     ],
