@@ -20,21 +20,13 @@ from spadwarp.device import pick_devices
 from spadwarp.frames import detector_response
 from spadwarp.mesh import TriangleMesh, build_mesh, focus_distance, guess_unit
 from spadwarp.mesh.targets import target_balls
-from spadwarp.scene import Scene, SceneLike, as_scene, daylight_rate, shot_at, shots_of
+from spadwarp.scene import Scene, SceneLike, as_scene, daylight_rate, phase_function, shot_at, shots_of
 from spadwarp.scene.camera import image_points, to_camera, to_world
 from spadwarp.scene.laser import Laser, profile_extent, spectral_lines
-from spadwarp.scene.medium import (
-    NOTABLE_UNSEEN,
-    WATER_INDICES,
-    Water,
-    grid_cells,
-    natural_laws,
-    phase_function,
-    scattering_matrix,
-)
+from spadwarp.scene.medium import NOTABLE_UNSEEN, WATER_INDICES, Water, grid_cells, natural_laws, scattering_matrix
 from spadwarp.scene.port import Port
 from spadwarp.scene.scene import camera_port, laser_port, water_lines
-from spadwarp.scene.sections import field_unit
+from spadwarp.scene.sections import interval_of
 from spadwarp.scene.sight import beam_planes, lines_of_sight, points_inside, port_advance, view_planes, within_port
 from spadwarp.transport import points_per_flight
 from spadwarp.transport.model import first_hits
@@ -337,10 +329,9 @@ def _doubts(field: str, model: Any, low: float, high: float, *units: str) -> lis
     value = getattr(model, name)
     if not isinstance(value, float) or value == 0.0 or low <= value <= high:
         return []
-    unit_of_field = field_unit(type(model).model_fields[name]) or "1"
-    unit = "" if unit_of_field == "1" else f" {unit_of_field}"
+    unit = f" {interval_of(type(model).model_fields[name]).unit}".rstrip()
     text = f"{value:g}{unit} is not plausible ({low:g} to {high:g}{unit} is)"
-    meant = {other: quantity(f"{value!r} {other}", unit_of_field) for other in units}
+    meant = {other: quantity(f"{value!r} {other}", unit.strip() or "1") for other in units}
     meant = {other: number for other, number in meant.items() if low <= number <= high}
     words = [f'"{value:g} {other}" ({number:g}{unit})' for other, number in meant.items()]
     text += f"; did you mean {' or '.join(words)}?" if words else ""
@@ -646,7 +637,7 @@ def _check_spectrum(survey: Survey) -> None:
         return
     if len(waters) == 1:
         return
-    weights = [line.share * math.exp(-(line.extinction - scene.medium.extinction) * path) for line in waters]
+    weights = [share * math.exp(-(water.extinction - scene.medium.extinction) * path) for share, water in waters]
     total = math.fsum(weights)
     if abs((ratio := total / passed) - 1.0) > 0.01:
         text = (
@@ -655,8 +646,9 @@ def _check_spectrum(survey: Survey) -> None:
             "the whole spectrum"
         )
         survey.note(field, text, ratio=ratio)
-    mean = math.fsum(weight / line.speed for weight, line in zip(weights, waters, strict=True)) / total
-    variance = math.fsum(w * (1.0 / line.speed - mean) ** 2 for w, line in zip(weights, waters, strict=True)) / total
+    slowness = [1.0 / water.pulse_speed for _, water in waters]
+    mean = math.fsum(weight * t for weight, t in zip(weights, slowness, strict=True)) / total
+    variance = math.fsum(w * (t - mean) ** 2 for w, t in zip(weights, slowness, strict=True)) / total
     spread_ps = 2.0 * math.sqrt(2.0 * math.log(2.0)) * math.sqrt(variance) * path * 1e12
     if spread_ps > 0.3 * survey.irf_fwhm_ps:
         text = f"dispersion spreads the target's light over {spread_ps:.3g} ps, and the response has "

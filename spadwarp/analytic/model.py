@@ -113,7 +113,7 @@ def pixel_maps(
         acquisitions=scene.pulses_per_depth_frame if chosen.count_law == "per_pulse" else chosen.frames,
         pulses_per_frame=chosen.exposure * scene.laser.repetition_rate,
         outliers=outliers,
-        lines=model.line_rows([line.scattering for line in model.lines]),
+        lines=model.line_rows([water.scattering for _, water in model.lines]),
         ambient=None if scene.daylight is None else model.on_device(ambient),
         optics=model.optics,
     )
@@ -202,15 +202,15 @@ class _Model:
     def line_rows(self, scattering: list[float]) -> Any:
         """Photons per pulse, extinction and scattering of each line of the spectrum."""
         lines = zip(self.lines, scattering, strict=True)
-        return self.on_device([(self.lidar.photons * line.share, line.extinction, b) for line, b in lines])
+        return self.on_device([(self.lidar.photons * share, water.extinction, b) for (share, water), b in lines])
 
     def signal(self, normal: ArrayLike, reflectance: ArrayLike) -> tuple[Floats, Floats]:
         """S, summed over the lines, and the mean arrival time of their photons, `[P]`."""
         lidar, surfaces = self.lidar, [*self.sights, self.on_device(normal), self.on_device(reflectance)]
         whole = (lidar.photons, lidar.extinction, lidar.speed)
         parts: list[tuple[Floats, Floats]] = []
-        for line in self.lines:
-            lidar.photons, lidar.extinction, lidar.speed = whole[0] * line.share, line.extinction, line.speed
+        for share, water in self.lines:
+            lidar.photons, lidar.extinction, lidar.speed = whole[0] * share, water.extinction, water.pulse_speed
             signal, arrival = sk.signal_map(lidar, *surfaces, optics=self.optics)
             parts.append((signal.numpy(), arrival.numpy()))
         lidar.photons, lidar.extinction, lidar.speed = whole
@@ -232,7 +232,7 @@ class _Model:
         if chosen.backscatter == "single_scatter":
             # Through cells, the table of water that scatters 1/m, times what the cells do.
             by_cells = self.scene.medium.grid is not None
-            rows = self.line_rows([1.0 if by_cells else line.scattering for line in self.lines])
+            rows = self.line_rows([1.0 if by_cells else water.scattering for _, water in self.lines])
             table = sk.single_scatter_table(lidar, self.phase, *self.sights, lines=rows, optics=self.optics)
             paths, cumulative, total = (part.numpy() for part in table)
             if not by_cells:

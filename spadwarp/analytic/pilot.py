@@ -28,8 +28,7 @@ from spadwarp.result import Channel, Result, analyser_channel, merge
 from spadwarp.scene import Scene, noise_rate
 from spadwarp.scene.camera import pixel_directions
 from spadwarp.scene.sight import depth_from_time, depth_per_time
-from spadwarp.transport import Progress, RunOptions, simulate, truth_maps
-from spadwarp.transport.reconstruction import known_light
+from spadwarp.transport import Progress, RunOptions, known_light, simulate, truth_maps
 from spadwarp.values import ConfigError, SpadwarpWarning
 
 __all__ = ["Pilot"]

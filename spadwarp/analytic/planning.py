@@ -30,8 +30,7 @@ from spadwarp.analytic.pilot import (
     typical_pixels,
     window,
 )
-from spadwarp.frames import detector_response
-from spadwarp.frames.depth import METHODS, Method
+from spadwarp.frames import METHODS, Method, detector_response
 from spadwarp.result import CHANNELS, POLARISED, Channel, Result
 from spadwarp.scene import Scene, SceneLike, Transport, as_scene
 from spadwarp.scene.camera import to_world
@@ -557,7 +556,7 @@ def with_gate(scene: Scene, span: tuple[float, float], margin: float) -> Scene:
 
     The bins keep their width. Raises `ConfigError` for a gate of more than a million bins.
     """
-    lines, index = lines_of_sight(scene).flat(), scene.medium.group_index
+    lines, index = lines_of_sight(scene), scene.medium.group_index
     # A pixel whose light does not get through the port has no time; one that is still in the port has that of its end.
     times = [time_from_path(lines.path_from_range(np.maximum(r, lines.lead + _LEAST)), index) for r in span]
     spread, width = time_from_range(margin, index), scene.gate.bin_width

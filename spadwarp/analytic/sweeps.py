@@ -19,7 +19,7 @@ from spadwarp.frames.depth import Method
 from spadwarp.io.text import parse_toml
 from spadwarp.result import POLARISED
 from spadwarp.scene import Scene, SceneLike, as_scene, parse_override
-from spadwarp.scene.sections import field_unit, locate, parse_key, takes_integers
+from spadwarp.scene.sections import field_unit, locate, parse_key, parts_of
 from spadwarp.values import (
     ArgumentError,
     ConfigError,
@@ -230,7 +230,7 @@ def parse_vary(text: str) -> tuple[str, list[Any]]:
     if field == "range" and len({part.strip()[-1] in "0123456789." for part in lengths}) > 1:
         raise ArgumentError(f"vary: range = {shown(spec)} is ambiguous: write the unit of all lengths, or of none")
     values = parse_values(spec, unit, name=f"vary: {field}")
-    if ":" in spec and info is not None and takes_integers(info):
+    if ":" in spec and int in (kinds := list(parts_of(info))) and float not in kinds:
         values = list(dict.fromkeys(round(value) for value in values))
     return field, values
 

@@ -20,12 +20,12 @@ from spadwarp.io.paths import example_or_path
 from spadwarp.io.text import read_toml
 from spadwarp.result import Channel
 from spadwarp.scene import Scene
-from spadwarp.scene.sections import Document, FilePath, Section, Whole, field, listed
+from spadwarp.scene.sections import Document, FilePath, Section, Whole, field
 from spadwarp.values import ArgumentError, ConfigError, check_real, shown
 
 __all__ = ["SPLITS", "Distribution", "Recipe", "load_recipe"]
 
-Names = Annotated[tuple[str, ...], BeforeValidator(listed)]
+Names = tuple[str, ...]
 Paths = Annotated[Names, FilePath()]
 
 
@@ -33,7 +33,7 @@ class Distribution(Section):
     """One of `choices`, equally likely, or uniform between `low` and `high`."""
 
     numeric: ClassVar[bool] = True
-    choices: Annotated[tuple[Any, ...], BeforeValidator(listed)] = ()
+    choices: tuple[Any, ...] = ()
     low: float | None = field(None, "lowest value", "[-1e19, 1e19]")
     high: float | None = field(None, "highest value", "[-1e19, 1e19]")
     log: bool = field(False, "whether uniform in the logarithm")
@@ -132,9 +132,8 @@ class Plume(Section):
     """Suspended matter between camera and target in part of the scenes."""
 
     probability: float = field(0.0, "part of the scenes that have one", "[0, 1]")
-    shape: Annotated[tuple[Shape, ...], BeforeValidator(listed), Field(min_length=1)] = field(
-        ("cloud", "plume", "sediment"), "shapes of medium.grid, equally likely"
-    )
+    shape: Annotated[tuple[Shape, ...], Field(min_length=1)] = ("cloud", "plume", "sediment")
+    """shapes of medium.grid, equally likely"""
     optical_depth: Positive = field(constant(1.0), "that it adds on the optical axis, one way")
     place: Share = field(Distribution(low=0.3, high=0.8), "of its middle, as part of the target's distance")
     shift: Real = field(constant(0.0), "sideways, drawn for x and for y [m]")
@@ -268,9 +267,8 @@ class Recipe(Document):
     vary: dict[str, Annotated[Distribution, BeforeValidator(distribution)]] = Field(
         default_factory=dict, description='further fields of the scene: "laser.preset" = ["lu2024", ...]'
     )
-    trajectory: Annotated[str, FilePath()] = field(
-        "", "table of fields of the scene by time (CSV), relative to the recipe: scene n of a target has row n"
-    )
+    trajectory: Annotated[str, FilePath()] = ""
+    """table of fields of the scene by time (CSV), relative to the recipe: scene n of a target has row n"""
     scene: dict[str, Any] = field(..., "the scene without targets and gate, as in a scene file")
     overrides_beside_file: ClassVar[bool] = True
 

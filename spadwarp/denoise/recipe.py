@@ -7,11 +7,11 @@ from collections.abc import Mapping, Sequence
 from typing import Annotated, Any, Literal, Self
 
 import pydantic
-from pydantic import AfterValidator, BeforeValidator, Field
+from pydantic import AfterValidator, Field
 
 from spadwarp.io.paths import example_or_path
 from spadwarp.io.text import read_toml
-from spadwarp.scene.sections import Document, Section, Whole, listed
+from spadwarp.scene.sections import Document, Section, Whole, field
 
 __all__ = ["TrainingRecipe", "load_training_recipe"]
 
@@ -31,63 +31,52 @@ def _ordered(limits: tuple[float, float]) -> tuple[float, float]:
 
 Share = Annotated[float, Field(ge=0, le=1)]
 Above0 = Annotated[float, Field(ge=1e-9, le=1e9)]
-_CHECKS = BeforeValidator(listed), AfterValidator(_ordered)
-Positive = Annotated[tuple[Above0, Above0], *_CHECKS]
-Shares = Annotated[tuple[Share, Share], *_CHECKS]
+Positive = Annotated[tuple[Above0, Above0], AfterValidator(_ordered)]
+Shares = Annotated[tuple[Share, Share], AfterValidator(_ordered)]
 
 
 class Noise(Section):
     """The noise of a training: `[lowest, highest]`, or a part of the samples."""
 
-    backscatter: Shares = Field(
-        (0.0, 0.6), description="part of the pixels that report backscatter; low ones are drawn more often"
-    )
-    sigma_scale: Positive = Field(
-        (0.3, 8.0), description="factor on a scene's Cramér–Rao bound, uniform in the logarithm"
-    )
-    decay: Positive = Field(
-        (0.3, 40.0), description="rate at which backscatter falls over the gate [1/gate], uniform in the logarithm"
-    )
-    own_gate: Share = Field(0.5, description="samples with the scene's own gate; the others have one of gate_width")
-    own_profile: Share = Field(0.7, description="of these, samples with the scene's own backscatter profile")
-    gate_width: Positive = Field((1.0, 8.0), description="width of other gates [m], uniform in the logarithm")
-    cut: Share = Field(0.0, description="samples whose gate ends within the scene: what is behind has no depth")
-    wide_gate: Share = Field(0.5, description="samples whose camera's gate is wider than what the network is given")
-    behind: Share = Field(0.55, description="samples with backscatter from behind the target too: multiple scattering")
-    slanted_gate: Share = Field(0.5, description="samples whose gate opens up to 15 % of its width nearer in depth")
-    counting: Share = Field(0.2, description="samples whose depth was estimated from histograms of few photons")
-    photons: Positive = Field((0.7, 150.0), description="of these, signal counts per pixel, uniform in the logarithm")
-    sbr: Positive = Field((0.03, 8.0), description="of these, signal over background counts, uniform in the logarithm")
-    scattered: Share = Field(0.0, description="of these, samples with forward-scattered light, delayed and spread")
-    delay: Positive = Field(
-        (0.004, 0.12), description="its mean delay [gate widths], uniform in the logarithm; on the way back less"
-    )
-    spread: Positive = Field((0.5, 20.0), description="its spread over the image [pixels], uniform in the logarithm")
-    halo: Share = Field(0.0, description="of these, samples with an optical depth of 0.01 to 3, mostly a halo")
-    events: Positive = Field(
-        (1e6, 1e6), description="of that light in a pixel, uniform in the logarithm: few in Monte Carlo histograms"
-    )
-    ambient: Share = Field(0.0, description="of these, samples with ambient light, which follows the reflectance")
-    two_returns: Share = Field(0.4, description="of these, samples in which pixels see a weaker second surface")
-    wrong: Share = Field(
-        0.0, description="of these, samples with a background, and with a response, that are not known well"
-    )
-    resampled: Share = Field(
-        0.0, description="samples whose depth is the mean over each pixel: at edges it lies between both surfaces"
-    )
-    sparse: Share = Field(0.25, description="samples in which only 3 to 100 % of the pixels report anything")
-    tail: Share = Field(0.15, description="samples whose jitter has a late tail, as avalanche photodiodes have")
-    hot: Share = Field(0.01, description="highest part of the pixels that report any depth because they are defective")
-    dead: Share = Field(0.1, description="highest part of the pixels that report nothing because they are defective")
-    unknown_water: Share = Field(0.2, description="samples whose backscatter profile is hidden from the network")
+    backscatter: Shares = field((0.0, 0.6), "part of the pixels that report backscatter; low ones are drawn more often")
+    sigma_scale: Positive = field((0.3, 8.0), "factor on a scene's Cramér–Rao bound, uniform in the logarithm")
+    decay: Positive = (0.3, 40.0)
+    """rate at which backscatter falls over the gate [1/gate], uniform in the logarithm"""
+    own_gate: Share = field(0.5, "samples with the scene's own gate; the others have one of gate_width")
+    own_profile: Share = field(0.7, "of these, samples with the scene's own backscatter profile")
+    gate_width: Positive = field((1.0, 8.0), "width of other gates [m], uniform in the logarithm")
+    cut: Share = field(0.0, "samples whose gate ends within the scene: what is behind has no depth")
+    wide_gate: Share = field(0.5, "samples whose camera's gate is wider than what the network is given")
+    behind: Share = field(0.55, "samples with backscatter from behind the target too: multiple scattering")
+    slanted_gate: Share = field(0.5, "samples whose gate opens up to 15 % of its width nearer in depth")
+    counting: Share = field(0.2, "samples whose depth was estimated from histograms of few photons")
+    photons: Positive = field((0.7, 150.0), "of these, signal counts per pixel, uniform in the logarithm")
+    sbr: Positive = field((0.03, 8.0), "of these, signal over background counts, uniform in the logarithm")
+    scattered: Share = field(0.0, "of these, samples with forward-scattered light, delayed and spread")
+    delay: Positive = (0.004, 0.12)
+    """its mean delay [gate widths], uniform in the logarithm; on the way back less"""
+    spread: Positive = field((0.5, 20.0), "its spread over the image [pixels], uniform in the logarithm")
+    halo: Share = field(0.0, "of these, samples with an optical depth of 0.01 to 3, mostly a halo")
+    events: Positive = (1e6, 1e6)
+    """of that light in a pixel, uniform in the logarithm: few in Monte Carlo histograms"""
+    ambient: Share = field(0.0, "of these, samples with ambient light, which follows the reflectance")
+    two_returns: Share = field(0.4, "of these, samples in which pixels see a weaker second surface")
+    wrong: Share = field(0.0, "of these, samples with a background, and with a response, that are not known well")
+    resampled: Share = 0.0
+    """samples whose depth is the mean over each pixel: at edges it lies between both surfaces"""
+    sparse: Share = field(0.25, "samples in which only 3 to 100 % of the pixels report anything")
+    tail: Share = field(0.15, "samples whose jitter has a late tail, as avalanche photodiodes have")
+    hot: Share = field(0.01, "highest part of the pixels that report any depth because they are defective")
+    dead: Share = field(0.1, "highest part of the pixels that report nothing because they are defective")
+    unknown_water: Share = field(0.2, "samples whose backscatter profile is hidden from the network")
 
 
 class Part(Noise):
     """A part of the samples with noise of its own: these fields and those of `[noise]`, by default as there."""
 
     share: float = Field(..., gt=0, le=1, description="part of the samples; all shares together are 1")
-    crowded: Share = Field(0.0, description="of these, samples whose scene is two scenes, one before the other")
-    open_water: Share = Field(0.0, description="of these, samples with a target in open water for certain")
+    crowded: Share = field(0.0, "of these, samples whose scene is two scenes, one before the other")
+    open_water: Share = field(0.0, "of these, samples with a target in open water for certain")
 
 
 def _given(table: Any) -> Any:
@@ -101,7 +90,7 @@ class Optimiser(Section):
     steps: Whole = Field(40_000, ge=1, le=10**12, description="updates of the weights")
     batch: Whole = Field(64, ge=1, le=10**6, description="crops per update")
     crop: Whole = Field(96, ge=LEAST_CROP, le=16384, description="side of a crop [pixels]")
-    wide: Share = Field(0.0, description="part of the updates with a quarter as many crops of twice the side")
+    wide: Share = field(0.0, "part of the updates with a quarter as many crops of twice the side")
     scenes: Whole = Field(512, ge=1, le=10**6, description="scenes that are drawn at a time; without a dataset")
     redraw: Whole = Field(200, ge=1, le=10**12, description="updates between two drawings of scenes")
     learning_rate: float = Field(1e-3, ge=1e-12, le=1e3, description="highest; falls along a cosine to a hundredth")
@@ -121,16 +110,15 @@ class Optimiser(Section):
 class TrainingRecipe(Document):
     """Everything a training depends on, checked and frozen."""
 
-    model: Literal["pyramid", "histograms", "dncnn", "usdn"] = Field(..., description="network")
-    start: Literal["pyramid", "histograms"] | None = Field(
-        None, description="the same name as model: the training starts from the weights of the package"
-    )
-    data: Annotated[str, Field(min_length=1)] | None = Field(
-        None, description="dataset (folder), relative to the working directory; without it, scenes are drawn"
+    model: Literal["pyramid", "histograms", "dncnn", "usdn"] = field(..., "network")
+    start: Literal["pyramid", "histograms"] | None = None
+    """the same name as model: the training starts from the weights of the package"""
+    data: Annotated[str, Field(min_length=1)] | None = field(
+        None, "dataset (folder), relative to the working directory; without it, scenes are drawn"
     )
     seed: Whole = Field(0, ge=0, le=2**63 - 1, description="of weights, crops and noise")
     noise: Noise = Noise()
-    mixture: tuple[Part, ...] = Field((), description="parts of the samples of histograms with other noise")
+    mixture: tuple[Part, ...] = field((), "parts of the samples of histograms with other noise")
     optimiser: Optimiser = Optimiser()
 
     @pydantic.model_validator(mode="before")

@@ -19,16 +19,14 @@ from numpy.typing import NDArray
 
 from spadwarp.analytic import AnalyticFile
 from spadwarp.arrays import Floats, on_host
-from spadwarp.dataset import FrameReader
-from spadwarp.dataset.recipe import SPLITS
+from spadwarp.dataset import SPLITS, FrameReader
 from spadwarp.files.loader import load, locate
 from spadwarp.frames import Frames, FramesFile, Receiver, SequenceFile, detect
 from spadwarp.io.arrays import write_array, write_exr
 from spadwarp.io.paths import atomic_path, write_file
 from spadwarp.io.text import json_text, write_text
-from spadwarp.result import Channel, analyser_channel
+from spadwarp.result import Channel, Result, analyser_channel
 from spadwarp.result.file import exr_notes
-from spadwarp.result.result import Result
 from spadwarp.scene import Scene, noise_rate, shots_of
 from spadwarp.scene.camera import CALIBRATION_ENDINGS, save_calibration, to_world
 from spadwarp.scene.sight import lines_of_sight

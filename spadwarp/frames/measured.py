@@ -25,8 +25,7 @@ from spadwarp.io.arrays import read_npy, read_npz
 from spadwarp.io.hdf5 import hdf5_format, open_hdf5
 from spadwarp.io.mat import SparseMatrix, Variable, open_mat
 from spadwarp.io.paths import existing_file, reading
-from spadwarp.result import Channel, analyser_channel, noise_problem
-from spadwarp.result.file import load_result
+from spadwarp.result import Channel, analyser_channel, load_result, noise_problem
 from spadwarp.values import ArgumentError, FileError, Interval, SpadwarpWarning, check_real, shown
 
 __all__ = ["read_histograms"]

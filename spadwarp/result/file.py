@@ -40,9 +40,8 @@ from spadwarp.result.tallies import (
     rebatched,
     total_of,
 )
-from spadwarp.scene import Scene
+from spadwarp.scene import Scene, shots_of
 from spadwarp.scene.camera import camera_attributes, pixel_directions
-from spadwarp.scene.scan import shots_of
 from spadwarp.values import ArgumentError, ConfigError, FileError, check_choice, check_integer, check_real, shown
 
 __all__ = ["ResultLike", "as_result", "load_result", "load_truth_exr", "load_truth_maps", "merge"]

@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from spadwarp.scene import Scene
-from spadwarp.scene.flux import FluxArray
+from spadwarp.scene.settings import FluxArray
 from spadwarp.values import ArgumentError, ConfigError, SpadwarpError, shown
 
 __all__ = ["FluxTallies", "SignedTallies", "Tallies"]

@@ -6,11 +6,9 @@
 
 from spadwarp.scene.ambient_light import *
 from spadwarp.scene.camera import *
-from spadwarp.scene.flux import *
 from spadwarp.scene.laser import *
 from spadwarp.scene.medium import *
 from spadwarp.scene.pose import *
-from spadwarp.scene.scan import *
 from spadwarp.scene.scene import *
 from spadwarp.scene.sections import *
 from spadwarp.scene.settings import *

@@ -19,22 +19,20 @@ import yaml
 from numpy.typing import ArrayLike, NDArray
 from pydantic import BeforeValidator, Field, model_validator
 
+from spadwarp.arrays import Floats
 from spadwarp.io.text import parse_json, read_text, write_text
 from spadwarp.scene.port import Port
 from spadwarp.scene.pose import rotation_matrix
-from spadwarp.scene.sections import AnyFile, Coordinate, Infinite, Section, Vector, Whole, field, field_range, listed
+from spadwarp.scene.sections import Coordinate, File, Infinite, Section, Vector, Whole, field, field_range
 from spadwarp.values import ArgumentError, ConfigError, FileError, check_integer, read_real, shown
 
 __all__ = ["Camera", "load_calibration", "save_calibration"]
-
-Points = NDArray[np.float64]
 
 _INTRINSICS = ("fx", "fy", "cx", "cy", "calibration")
 
 
 def _padded(value: Any) -> Any:
     """Four coefficients of distortion lack k3, as OpenCV allows."""
-    value = listed(value)
     return (*value, 0.0) if isinstance(value, tuple) and len(value) == 4 else value
 
 
@@ -69,7 +67,7 @@ class Camera(Section):
     cx: Coordinate | None = field(None, "column of the optical axis, 0 at the first pixel's centre; default: middle")
     cy: Coordinate | None = field(None, "row of the optical axis, likewise")
     distortion: Brown = field((0.0,) * 5, "Brown's lens distortion k1, k2, p1, p2, k3, OpenCV's order")
-    calibration: AnyFile = field(None, "OpenCV's YAML or JSON file, whose fx, fy, cx, cy and distortion take its place")
+    calibration: File = field(None, "OpenCV's YAML or JSON file, whose fx, fy, cx, cy and distortion take its place")
     aperture_diameter: float | None = field(None, "diameter of the entrance aperture [m]", "[1e-9, 1e6]")
     f_number: float | None = field(None, "focal length over aperture diameter", "[0.001, 1e6]")
     focus_distance: Annotated[
@@ -110,7 +108,7 @@ class Camera(Section):
             yield f"focal_length is missing; {needs_it[0]} needs it"
         yield from self._only_with("fx", self.fx is not None, "fy", "cx", "cy")
         if self.focus_distance != "target" and self.focus_distance <= (self.focal_length or 0.0):
-            yield self._that("focus_distance", f"is outside ({self.focal_length}, inf], beyond the focal length")
+            yield self._that("focus_distance", f"is outside ({self.focal_length}, inf] m, beyond the focal length")
         if not is_invertible(self):
             size = f"{self.width} x {self.height}"
             yield self._that("distortion", f"is not one-to-one: some of its {size} pixels show no direction, or two")
@@ -120,11 +118,6 @@ class Camera(Section):
         """Names of the polarisation in a result: ("co", "cross") of an analyser and of one across it, the Stokes vector
         ("I", "Q", "U", "V"), or nothing."""
         return {"none": (), "analyser": ("co", "cross"), "stokes": ("I", "Q", "U", "V")}[self.polarisation]
-
-    @property
-    def tallied_channels(self) -> tuple[str, ...]:
-        """Channels with tallies of their own: all but the intensity, which is the histogram."""
-        return tuple(name for name in self.channels if name != "I")
 
     @property
     def focal_pixels(self) -> tuple[float, float]:
@@ -202,12 +195,12 @@ class Camera(Section):
         return math.pi * self.aperture_radius**2
 
 
-def to_camera(camera: Camera, points: ArrayLike) -> Points:
+def to_camera(camera: Camera, points: ArrayLike) -> Floats:
     """Points of the world `[..., 3]` [m] in the camera's frame."""
     return (np.asarray(points, np.float64) - camera.position) @ rotation_matrix(camera.rotation_deg)
 
 
-def to_world(camera: Camera, points: ArrayLike) -> Points:
+def to_world(camera: Camera, points: ArrayLike) -> Floats:
     """Points of the camera's frame `[..., 3]` [m] in the world."""
     return np.asarray(points, np.float64) @ rotation_matrix(camera.rotation_deg).T + camera.position
 
@@ -219,13 +212,13 @@ def to_world(camera: Camera, points: ArrayLike) -> Points:
 _MARGIN = 0.01
 
 
-def image_points(camera: Camera, tangents: ArrayLike) -> Points:
+def image_points(camera: Camera, tangents: ArrayLike) -> Floats:
     """Image coordinates at which directions with the given tangents are seen, `[..., 2]`."""
     seen, _ = _distort(np.asarray(tangents, np.float64), camera.distortion)
     return seen * camera.focal_pixels + camera.principal_point
 
 
-def image_tangents(camera: Camera, points: ArrayLike) -> Points:
+def image_tangents(camera: Camera, points: ArrayLike) -> Floats:
     """Tangents of the directions that are seen at image coordinates, `[..., 2]`: `image_points` undone, by Newton's
     method; NaN where no direction is seen."""
     seen = (np.asarray(points, np.float64) - camera.principal_point) / camera.focal_pixels
@@ -245,7 +238,7 @@ def image_tangents(camera: Camera, points: ArrayLike) -> Points:
     return tangents
 
 
-def pixel_directions(camera: Camera) -> Points:
+def pixel_directions(camera: Camera) -> Floats:
     """Unit vectors from the lens centre through the pixel centres, float64 `[H, W, 3]`."""
     centres = np.stack(np.meshgrid(np.arange(camera.width) + 0.5, np.arange(camera.height) + 0.5), axis=-1)
     rays = np.concatenate([image_tangents(camera, centres), np.ones((camera.height, camera.width, 1))], axis=-1)
@@ -277,13 +270,13 @@ def view_box(camera: Camera) -> tuple[float, float, float, float]:
     return left, top, right, bottom
 
 
-def pixel_views(camera: Camera) -> Points:
+def pixel_views(camera: Camera) -> Floats:
     """As `view_box` for each pixel alone: `[H, W, 4]`."""
     corners = image_tangents(camera, _grid(np.arange(camera.width + 1.0), np.arange(camera.height + 1.0)))
     return _boxes(camera, np.stack([corners[:-1, :-1], corners[:-1, 1:], corners[1:, :-1], corners[1:, 1:]]))
 
 
-def _boxes(camera: Camera, tangents: Points) -> Points:
+def _boxes(camera: Camera, tangents: Floats) -> Floats:
     """Boxes `[..., 4]` that hold tangents `[N, ..., 2]`."""
     margin = _MARGIN / np.array(camera.focal_pixels)
     return np.concatenate([tangents.min(axis=0) - margin, tangents.max(axis=0) + margin], axis=-1)
@@ -305,12 +298,12 @@ def camera_attributes(camera: Camera, focus_distance: float | None) -> dict[str,
     }
 
 
-def _grid(columns: Points, rows: Points) -> Points:
+def _grid(columns: Floats, rows: Floats) -> Floats:
     """`[R, C, 2]`."""
     return np.stack(np.meshgrid(columns, rows), axis=-1)
 
 
-def _distort(tangents: Points, coefficients: tuple[float, ...]) -> tuple[Points, tuple[Points, Points, Points]]:
+def _distort(tangents: Floats, coefficients: tuple[float, ...]) -> tuple[Floats, tuple[Floats, Floats, Floats]]:
     """Brown's model (1966) in OpenCV's order k1, k2, p1, p2, k3; and its derivatives: of x by x, of x by y and of y by
     x, which are the same, of y by y."""
     k1, k2, p1, p2, k3 = coefficients
@@ -372,45 +365,35 @@ def save_calibration(camera: Camera, path: str | Path) -> Path:
         raise ArgumentError(f"{path}: ending {path.suffix!r} is not one of {', '.join(CALIBRATION_ENDINGS)}")
     numbers: Any = camera_attributes(camera, None)
     entries: dict[str, Any] = {"image_width": camera.width, "image_height": camera.height}
-    for name, rows, values in (
-        ("camera_matrix", 3, "camera_matrix"),
-        ("distortion_coefficients", 1, "camera_distortion"),
-    ):
-        data = numbers[values].tolist()
+    for name, rows, values in (("camera_matrix", 3, "matrix"), ("distortion_coefficients", 1, "distortion")):
+        data = numbers[f"camera_{values}"].tolist()
         entries[name] = {"type_id": "opencv-matrix", "rows": rows, "cols": len(data) // rows, "dt": "d", "data": data}
     if ending == ".json":
         return write_text(json.dumps(entries, indent=1) + "\n", path)
-    write = _xml_lines if ending == ".xml" else _yaml_lines
-    return write_text("\n".join([*write(entries), ""]), path)
+    return write_text("\n".join([*_lines(entries, ending == ".xml"), ""]), path)
 
 
-def _xml_lines(entries: Mapping[str, Any]) -> Iterator[str]:
-    yield from ('<?xml version="1.0"?>', "<opencv_storage>")
+def _lines(entries: Mapping[str, Any], xml: bool) -> Iterator[str]:
+    """Lines of the entries in XML or YAML."""
+    yield from ('<?xml version="1.0"?>', "<opencv_storage>") if xml else ("%YAML:1.0", "---")
     for name, value in entries.items():
         if not isinstance(value, Mapping):
-            yield f"<{name}>{value}</{name}>"
+            yield f"<{name}>{value}</{name}>" if xml else f"{name}: {value}"
             continue
-        yield f'<{name} type_id="opencv-matrix">'
+        yield f'<{name} type_id="opencv-matrix">' if xml else f"{name}: !!opencv-matrix"
+        numbers = map(repr, value["data"])
+        parts = {**value, "data": " ".join(numbers) if xml else f"[ {', '.join(numbers)} ]"}
         for key in ("rows", "cols", "dt", "data"):
-            text = " ".join(map(repr, value[key])) if key == "data" else value[key]
-            yield f"  <{key}>{text}</{key}>"
-        yield f"</{name}>"
-    yield "</opencv_storage>"
-
-
-def _yaml_lines(entries: Mapping[str, Any]) -> Iterator[str]:
-    yield from ("%YAML:1.0", "---")
-    for name, value in entries.items():
-        yield f"{name}: {'!!opencv-matrix' if isinstance(value, Mapping) else value}"
-        if isinstance(value, Mapping):
-            yield from (f"   {key}: {value[key]}" for key in ("rows", "cols", "dt"))
-            yield f"   data: [ {', '.join(map(repr, value['data']))} ]"
+            yield f"  <{key}>{parts[key]}</{key}>" if xml else f"   {key}: {parts[key]}"
+        if xml:
+            yield f"</{name}>"
+    if xml:
+        yield "</opencv_storage>"
 
 
 def _entries(text: str) -> dict[str, Any]:
     """Names and values of a file in XML, JSON or YAML. Raises `ValueError`."""
-    start = text.lstrip()[:1]
-    kind = {"<": "XML", "{": "JSON"}.get(start, "YAML")
+    kind = {"<": "XML", "{": "JSON"}.get(text.lstrip()[:1], "YAML")
     try:  # OpenCV's first line is no YAML
         if kind == "XML":
             return _xml_entries(text)

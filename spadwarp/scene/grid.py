@@ -17,7 +17,7 @@ from spadwarp.io.arrays import read_npz
 from spadwarp.io.hdf5 import read_hdf5
 from spadwarp.io.paths import existing_file
 from spadwarp.scene.pose import rotation_matrix, vector_of
-from spadwarp.scene.sections import AnyFile, Counts, Scale, Section, Size, Vector, Whole, field, field_range, file_of
+from spadwarp.scene.sections import Counts, File, Scale, Section, Size, Vector, Whole, field, field_range, file_of
 from spadwarp.values import ConfigError, FileError, Interval, SpadwarpError
 
 COEFFICIENTS = ("absorption", "scattering", "extinction", "albedo")
@@ -43,7 +43,7 @@ class Grid(Section):
     """
 
     displaces: ClassVar = {"file": ("shape", *_OF_SHAPES), "shape": ("file",)}
-    file: AnyFile = field(None, "path of a .npz, .h5 or .nvdb file with cells, relative to the scene file")
+    file: File = field(None, "path of a .npz, .h5 or .nvdb file with cells, relative to the scene file")
     shape: Literal["cloud", "plume", "sediment", "gradient"] | None = None
     """in place of a file: a round cloud, a plume that rises, matter stirred up from the bottom, a rise from top to
     bottom; the box's y points down"""
@@ -52,9 +52,8 @@ class Grid(Section):
     extinction: float = field(1.0, "what density 1 adds to the medium's extinction [1/m]", "[0, 1e6]")
     albedo: float = field(0.8, "single-scattering albedo of what is added", "[0, 1]")
     anisotropy: float | None = field(None, "henyey_greenstein: g of what is added; default: the medium's", "(-1, 1)")
-    constituent: str | None = field(
-        None, "the medium's constituent of which density is so much more than the medium has"
-    )
+    constituent: str | None = None
+    """the medium's constituent of which density is so much more than the medium has"""
     turbulence: float = Field(0.0, ge=0, le=3)
     """shape: standard deviation of the logarithm of the density about the shape, by eddies of von Kármán's spectrum"""
     eddy_size: float | None = Field(None, ge=1e-6, le=1e9)
@@ -97,11 +96,9 @@ class Grid(Section):
     @property
     def cell_counts(self) -> tuple[int, int, int]:
         """`cells` as three numbers: with one, cells are about as long as wide."""
-        if len(self.cells) == 3:
-            x, y, z = self.cells
-            return x, y, z
         edges = self.edges or (1.0, 1.0, 1.0)
-        x, y, z = (max(1, round(self.cells[0] * edge / max(edges))) for edge in edges)
+        even = (max(1, round(self.cells[0] * edge / max(edges))) for edge in edges)
+        x, y, z = self.cells if len(self.cells) == 3 else even
         return x, y, z
 
     def to_dict(self) -> dict[str, Any]:
@@ -113,24 +110,21 @@ class Grid(Section):
 # Shapes
 
 
-def shape_values(shape: str, x: Floats, y: Floats, z: Floats) -> Floats:
-    """Density of a shape in the box's own coordinates, which run from -1 to 1; y points down, as in the world."""
-    if shape == "cloud":  # a Gaussian in all directions, of a standard deviation of a third of half the edge
-        return np.exp(-4.5 * (x**2 + y**2 + z**2))
-    if shape == "plume":  # a Gaussian across, from the middle of the bottom upwards, four times as wide at the top
-        width = 0.1 + 0.15 * (1.0 - y)
-        return (0.1 / width) ** 2 * np.exp(-0.5 * (x**2 + z**2) / width**2)
-    if shape == "sediment":  # from the bottom it falls to 1/e in a fifth of the height, and towards the sides
-        return np.exp(-5.0 * 0.5 * (1.0 - y)) * np.cos(0.5 * np.pi * x) ** 2 * np.cos(0.5 * np.pi * z) ** 2
-    return 0.5 * (1.0 + y) + 0.0 * (x + z)  # from 0 at the top to 1 at the bottom
-
-
 def shape_density(grid: Grid) -> Floats:
     """Density of each cell at its middle, `[x, y, z]`, of a grid with a shape."""
     counts, edges = grid.cell_counts, grid.edges
-    assert grid.shape is not None and edges is not None  # see Grid
-    axes = [(2.0 * np.arange(count) + 1.0) / count - 1.0 for count in counts]
-    density = shape_values(grid.shape, axes[0][:, None, None], axes[1][:, None], axes[2])
+    assert edges is not None  # see Grid
+    # The box's own coordinates run from -1 to 1; y points down, as in the world.
+    x, y, z = np.meshgrid(*((2.0 * np.arange(n) + 1.0) / n - 1.0 for n in counts), indexing="ij", sparse=True)
+    if grid.shape == "cloud":  # a Gaussian in all directions, of a standard deviation of a third of half the edge
+        density = np.exp(-4.5 * (x**2 + y**2 + z**2))
+    elif grid.shape == "plume":  # a Gaussian across, from the middle of the bottom upwards, at the top 4 times as wide
+        width = 0.1 + 0.15 * (1.0 - y)
+        density = (0.1 / width) ** 2 * np.exp(-0.5 * (x**2 + z**2) / width**2)
+    elif grid.shape == "sediment":  # from the bottom it falls to 1/e in a fifth of the height, and towards the sides
+        density = np.exp(-5.0 * 0.5 * (1.0 - y)) * np.cos(0.5 * np.pi * x) ** 2 * np.cos(0.5 * np.pi * z) ** 2
+    else:
+        density = 0.5 * (1.0 + y) + 0.0 * (x + z)  # from 0 at the top to 1 at the bottom
     if grid.turbulence > 0.0:
         eddies = turbulent_field(counts, edges, grid.eddy_size or min(edges) / 3.0, grid.seed, grid.frame)
         density = density * np.exp(grid.turbulence * eddies - 0.5 * grid.turbulence**2)
@@ -173,16 +167,14 @@ GRID_ARRAYS = {
 """Arrays of a file `[x, y, z]`, or of several frames `[frame, x, y, z]`, and their ranges."""
 _PLACES = {"size": "(0, inf)", "cell_size": "(0, inf)", "origin": "(-inf, inf)"}
 
-Place = tuple[float, float, float]
-
 
 class GridFile(NamedTuple):
     """Cells of a file: arrays by the names of `GRID_ARRAYS`, `[frame, x, y, z]` float32; edges of the box [m], None if
     the scene has to say; its lower corner in the file's own frame [m], None if it stands about its middle."""
 
     arrays: Mapping[str, NDArray[np.float32]]
-    size: Place | None = None
-    origin: Place | None = None
+    size: Vector | None = None
+    origin: Vector | None = None
 
 
 def read_grid(path: str | Path) -> GridFile:
@@ -294,8 +286,8 @@ class GridCells:
     extinction: NDArray[np.float32]  # c [1/m], `[x, y, z]` along the box's own axes
     albedo: NDArray[np.float32]  # b/c
     anisotropy: NDArray[np.float32] | None  # g; None: the medium's everywhere
-    size: Place  # edges of the box [m]
-    centre: Place  # its middle in the world [m]
+    size: Vector  # edges of the box [m]
+    centre: Vector  # its middle in the world [m]
     rotation: Floats  # its own axes in the world, as columns
 
     @property
@@ -365,16 +357,23 @@ def cells_of(grid: Grid, water: tuple[float, float, float], has_table: bool, sta
         found = {name: _frame(grid, values) for name, values in file.arrays.items()}
     if grid.constituent is not None and "density" not in found:
         raise ConfigError(f"medium.grid.constituent = {grid.constituent!r} needs density, which {grid.file} has not")
-    own_g = found.get("anisotropy")
-    if own_g is not None and has_table:
+    g = found.get("anisotropy")
+    if g is not None and has_table:
         raise ConfigError(
             f"medium.grid.file = {grid.file!r} has an anisotropy, which goes with phase_function = "
             "'henyey_greenstein' only; cells share any other"
         )
-    if "density" in found:
-        c, omega, g = _added(grid, found["density"], water, own_g)
+    if "density" in found:  # coefficients add up, the mean cosine is that of both scatterings together
+        extinction, albedo, anisotropy = water
+        added, g = grid.extinction * found["density"], grid.anisotropy if g is None else g
+        c = extinction + added
+        b = extinction * albedo + grid.albedo * added
+        omega = np.clip(b / np.maximum(c, 1e-30), 0.0, 1.0)
+        if g is not None:
+            both = (extinction * albedo * anisotropy + grid.albedo * added * g) / np.maximum(b, 1e-30)
+            g = np.where(b > 0.0, both, anisotropy)
     else:
-        c, omega, g = *_coefficients(found), own_g
+        c, omega = _coefficients(found)
     size = np.array(edges) * grid.scale
     rotation = rotation_matrix(grid.rotation_deg)
     own = np.zeros(3) if origin is None else (np.array(origin) + 0.5 * np.array(edges)) * grid.scale
@@ -397,21 +396,6 @@ def _frame(grid: Grid, values: NDArray[np.float32]) -> NDArray[np.float32]:
     low = min(int(grid.frame), max(last - 1, 0))
     part = np.float32(grid.frame - low)
     return values[low] if part == 0.0 else (1 - part) * values[low] + part * values[low + 1]
-
-
-def _added(
-    grid: Grid, density: Cells, water: tuple[float, float, float], own_anisotropy: Cells | None
-) -> tuple[Cells, Cells, Cells | None]:
-    """The medium with suspended matter: coefficients add up, the mean cosine is that of both scatterings together."""
-    extinction, albedo, anisotropy = water
-    added = grid.extinction * density
-    c = extinction + added
-    b = extinction * albedo + grid.albedo * added
-    g, mean = grid.anisotropy if own_anisotropy is None else own_anisotropy, None
-    if g is not None:
-        both = (extinction * albedo * anisotropy + grid.albedo * added * g) / np.maximum(b, 1e-30)
-        mean = np.where(b > 0.0, both, anisotropy)
-    return c, np.clip(b / np.maximum(c, 1e-30), 0.0, 1.0), mean
 
 
 def _coefficients(found: Mapping[str, NDArray[np.float32]]) -> tuple[Cells, Cells]:

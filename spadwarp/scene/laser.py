@@ -14,25 +14,14 @@ from typing import Annotated, Any, ClassVar, Literal, NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
-from pydantic import BeforeValidator, Field
+from pydantic import Field
 
 from spadwarp.arrays import Floats
 from spadwarp.io.arrays import read_exr, read_npy
 from spadwarp.io.paths import existing_file, reading
 from spadwarp.scene.port import Port
 from spadwarp.scene.pose import unit_vector
-from spadwarp.scene.sections import (
-    AnyFile,
-    CsvFile,
-    Direction,
-    Section,
-    Vector,
-    field,
-    field_range,
-    file_of,
-    listed,
-    read_table,
-)
+from spadwarp.scene.sections import CsvFile, Direction, File, Section, Vector, field, field_range, file_of, read_table
 from spadwarp.scene.settings import Detector
 from spadwarp.values import PLANCK, SPEED_OF_LIGHT, ConfigError, FileError, Interval
 from spadwarp.water.seawater import RANGES
@@ -63,15 +52,14 @@ class Laser(Section):
     """what it shines through: a port of its own, whose lengths start at `position`, or that of the camera"""
     profile: Literal["uniform_cone", "gaussian", "collimated", "measured"] = "uniform_cone"
     """even over a cone; exp(-2 tan²α/tan²θ); parallel; or an image"""
-    profile_image: AnyFile = field(None, "irradiance across a measured beam: .npy, .exr, .png (linear), rows downwards")
+    profile_image: File = field(None, "irradiance across a measured beam: .npy, .exr, .png (linear), rows downwards")
     half_angle_deg: float = field(15.0, "θ of the cone, 1/e² of the gaussian, half the image [°]", "[1e-6, 180]")
     beam_radius: float = field(0.0, "radius of the collimated beam [m]; 0 is a pencil beam", "[0, 1e6]")
     wavelength_nm: float = field(532.0, "in vacuum [nm]; with a spectrum that of photons and water", "[1e-9, 1e6]")
     linewidth_nm: float = field(0.0, "of a Gaussian spectrum, width at half maximum [nm]; 0: one line", "[0, 100000]")
     spectrum: CsvFile = field(None, "a measured spectrum: .csv file of wavelength [nm] and power per nm of any scale")
     wavelengths_nm: (
-        Literal["spectrum"]
-        | Annotated[tuple[Annotated[float, Field(ge=1e-9, le=1e6)], ...], BeforeValidator(listed), Field(max_length=64)]
+        Literal["spectrum"] | Annotated[tuple[Annotated[float, Field(ge=1e-9, le=1e6)], ...], Field(max_length=64)]
     ) = ()
     """lines that `spadwarp simulate` traces with the same photons, each in its own water [nm]; "spectrum": those of the
     laser's spectrum that the filter passes; everything else takes wavelength_nm"""
@@ -88,12 +76,12 @@ class Laser(Section):
 
     def _problems(self) -> Iterator[str]:
         if self.profile in ("gaussian", "measured") and self.half_angle_deg >= 90:
-            yield self._that("half_angle_deg", f"is outside (0, 90), the range of a {self.profile} profile")
+            yield self._that("half_angle_deg", f"is outside (0, 90) °, the range of a {self.profile} profile")
         if self.profile == "measured" and self.profile_image is None:
             yield "needs profile_image with profile = 'measured': the path of an image of the beam"
         yield from self._only_with("profile = 'measured'", self.profile == "measured", "profile_image")
         if self.linewidth_nm > (most := 0.2 * self.wavelength_nm):
-            reason = f"is outside [0, {most:g}], a fifth of wavelength_nm; a broader source needs spectrum"
+            reason = f"is outside [0, {most:g}] nm, a fifth of wavelength_nm; a broader source needs spectrum"
             yield self._that("linewidth_nm", reason)
         if self.spectrum is not None and self.linewidth_nm > 0.0:
             yield self._that("linewidth_nm", "cannot be combined with spectrum")

@@ -12,7 +12,7 @@ from typing import Annotated, Any, ClassVar, Literal, NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike
-from pydantic import BeforeValidator, Field, PrivateAttr, field_validator
+from pydantic import Field, PrivateAttr, field_validator
 
 from spadwarp.arrays import Floats
 from spadwarp.scene.grid import COEFFICIENTS, Grid, GridCells, cells_of
@@ -27,7 +27,7 @@ from spadwarp.scene.sections import (
     field,
     field_range,
     file_of,
-    listed,
+    from_one,
     read_table,
 )
 from spadwarp.values import ConfigError, bounds, pulse_speed
@@ -157,8 +157,7 @@ class Constituent(PhaseLaw):
 
 
 # One for the medium and one for each layer, or one for all.
-_one_or_more = BeforeValidator(lambda value: (value,) if isinstance(value, int | float) else listed(value))
-ByWater = Annotated[tuple[Annotated[float, Field(ge=0, le=1e6)], ...], _one_or_more]
+ByWater = Annotated[tuple[Annotated[float, Field(ge=0, le=1e6)], ...], from_one(1)]
 
 
 class Inelastic(Section):
@@ -180,8 +179,7 @@ class Inelastic(Section):
         fluoresces = self.process == "fluorescence"
         if fluoresces and self.coefficient is None:
             yield "needs coefficient with process = 'fluorescence': absorption by chlorophyll times its quantum yield"
-        if not fluoresces and self.decay_time_ns > 0.0:
-            yield self._that("decay_time_ns", "goes with process = 'fluorescence' only")
+        yield from self._only_with("process = 'fluorescence'", fluoresces, "decay_time_ns")
 
     def in_waters(self, waters: Sequence[Medium | Layer], wavelength_nm: float) -> list[tuple[float, float, float]]:
         """Of the medium and its layers: `coefficient`, extinction and scattering [1/m].
@@ -298,10 +296,10 @@ class Medium(PhaseLaw, Water):
     """tabulated: path of a .csv file of angle [°], m12, m22, m33, m34 and m44 over m11; `spadwarp water` writes one
     """
     largest_polarisation: float = field(0.66, "scaled_rayleigh: polarisation of light at 90°", RANGES["largest"])
-    constituents: Annotated[tuple[Constituent, ...], BeforeValidator(listed), Field(max_length=MOST_CONSTITUENTS)] = ()
+    constituents: Annotated[tuple[Constituent, ...], Field(max_length=MOST_CONSTITUENTS)] = ()
     """what the water is made of, in place of coefficients and phase function: their coefficients add up, those of pure
     water among them; at most 4"""
-    inelastic: Annotated[tuple[Inelastic, ...], BeforeValidator(listed), Field(max_length=2)] = ()
+    inelastic: Annotated[tuple[Inelastic, ...], Field(max_length=2)] = ()
     """light of other wavelengths, one of each process, which the absorption has lost; not with grid"""
     group_index: float = Field(WATER_INDICES["seawater"][1], ge=1, le=3)
     """index for the time of flight; "seawater" and "fresh" stand for 1.3638 and 1.3566"""
@@ -309,7 +307,7 @@ class Medium(PhaseLaw, Water):
     """refractive index; "seawater" and "fresh" stand for 1.3415 and 1.3350"""
     temperature: float | None = field(None, "gives missing indices, with salinity 35 [°C]", RANGES["temperature"])
     salinity: float | None = field(None, "the same, with temperature 20 [g/kg]", RANGES["salinity"])
-    layers: Annotated[tuple[Layer, ...], BeforeValidator(listed)] = field((), "waters further along `layer_axis`")
+    layers: tuple[Layer, ...] = field((), "waters further along `layer_axis`")
     layer_axis: Direction = field((0.0, 0.0, 1.0), "direction across the layers, in the world; not 0")
     grid: Grid | None = field(None, "water that varies within a box, cell by cell; not with layers")
     _molecular_share: float = PrivateAttr(0.0)
@@ -376,7 +374,7 @@ class Medium(PhaseLaw, Water):
             yield f"grid.constituent = {self.grid.constituent!r} is not one of {', '.join(names)}"
         for i, water in enumerate(self.waters, -1):
             place = "" if water is self else f"layers[{i}]."
-            if (c := self._sum(water)[2]) not in (allowed := field_range(type(self), "extinction")):
+            if (c := self._mixed(water)["extinction"]) not in (allowed := field_range(type(self), "extinction")):
                 yield f"{place}extinction = {c} of the constituents is outside {allowed}"
 
     def concentrations_in(self, water: Medium | Layer) -> list[float]:
@@ -393,11 +391,11 @@ class Medium(PhaseLaw, Water):
         whole = math.fsum(parts := self.scattering_in(water))
         return [part / whole if whole > 0.0 else 1.0 / len(parts) for part in parts]
 
-    def _sum(self, water: Medium | Layer) -> tuple[float, float, float]:
-        """a, b and c of the medium or a layer from constituents [1/m]."""
+    def _mixed(self, water: Medium | Layer) -> dict[str, float]:
+        """Coefficients of the medium or a layer from constituents [1/m]."""
         numbers, b = self.concentrations_in(water), math.fsum(self.scattering_in(water))
         a = math.fsum(n * one.absorption for n, one in zip(numbers, self.constituents, strict=True))
-        return a, b, a + b
+        return {"absorption": a, "scattering": b, "extinction": a + b}
 
     def _follow(self, wavelength_nm: float) -> None:
         """Sets what depends on the wavelength."""
@@ -407,9 +405,8 @@ class Medium(PhaseLaw, Water):
             own = {name: getattr(one, name) for name in _LAW_FIELDS}
             self.__dict__.update(own if len(self.constituents) == 1 else {"phase_function": MIXTURE})
             for water in self.waters:
-                a, b, c = self._sum(water)
-                pair = {"absorption": a, "scattering": b, "extinction": c, "albedo": b / c}
-                water.__dict__.update(pair)
+                mixed = self._mixed(water)
+                water.__dict__.update(mixed, albedo=mixed["scattering"] / mixed["extinction"])
         for water in self.waters:
             names = [] if water.chlorophyll is None else [*COEFFICIENTS]
             if water is self and self.follows_wavelength:
@@ -461,11 +458,13 @@ class Medium(PhaseLaw, Water):
 
     @property
     def phase_functions(self) -> list[PhaseFunction]:
-        """Those of the medium and, with constituents, of its layers and of those that cells have shares of. Raises what
-        `phase_function` raises."""
+        """Those of the medium; of layers and cells with an anisotropy of their own; with constituents, of layers and of
+        those that cells have shares of. Raises what `phase_function` and `grid_cells` raise."""
         layers = self.layers if self.phase_function == MIXTURE else ()
         of_cells = phase_function(self).constituents if self.grid is not None else ()
-        return [phase_function(self), *(phase_function(self, layer) for layer in layers), *of_cells]
+        own = () if self.has_phase_table else (PhaseLaw(anisotropy=g) for g in self.range.anisotropies)
+        laws = [*(phase_function(self, layer) for layer in layers), *(_law_of(law, "medium") for law in own)]
+        return [phase_function(self), *laws, *of_cells]
 
     @property
     def has_phase_table(self) -> bool:

@@ -18,7 +18,7 @@ from pydantic import Field
 
 from spadwarp.arrays import Floats
 from spadwarp.io.text import read_toml
-from spadwarp.scene.pose import unit_vector, vector_of
+from spadwarp.scene.pose import unit_vector
 from spadwarp.scene.sections import Direction, Section, Vector, field
 
 # Steps of Newton's method, which has converged after 4 to 12, and the last: the error is its square.
@@ -112,17 +112,6 @@ class Port(Section):
         """`normal` as a unit vector."""
         return unit_vector(self.normal)
 
-    def placed(
-        self, origin: Floats, normal: ArrayLike, *, wavelength_nm: float, water: tuple[float, float]
-    ) -> PortGeometry:
-        """The port with its lengths from `origin` and its normal in the frame of the camera; `water`: (phase, group)
-        index of the water. Raises as `indices` does."""
-        index, group_index = zip(*self.indices(wavelength_nm), water, strict=True)
-        normal = np.asarray(normal, np.float64)
-        distance, centre = (self.distance or 0.0) + float(origin @ normal), origin + np.array(self.offset)
-        radius, ends = self.radius or 0.0, (vector_of(normal), vector_of(centre))
-        return PortGeometry(self.shape, distance, ends[0], radius, ends[1], self.thickness, index, group_index)
-
 
 @dataclass(frozen=True)
 class PortGeometry:
@@ -187,10 +176,17 @@ class PortGeometry:
     def _faces(self, x: ArrayLike, u: ArrayLike) -> Iterator[tuple[Floats, Floats, Floats, Floats, Floats]]:
         """At the inner and the outer face: length up to it, cosines before and behind it, place and direction."""
         y, v = np.broadcast_arrays(np.asarray(x, np.float64), np.asarray(u, np.float64))
+        normals, centre = np.broadcast_to(self.normal, y.shape), np.array(self.centre)
         for k, outward in enumerate((0.0, self.thickness)):
-            length = self._to_face(y, v, outward)
+            if self.shape == "flat":
+                climb = v @ np.array(self.normal)
+                length = (self.distance + outward - y @ np.array(self.normal)) / np.where(climb > 0.0, climb, np.nan)
+            else:
+                b = ((y - centre) * v).sum(axis=-1)
+                length = np.sqrt(b * b - ((y - centre) ** 2).sum(axis=-1) + (self.radius + outward) ** 2) - b
             y = y + length[..., None] * v
-            normals = self._normals(y)
+            if self.shape == "dome":
+                normals = (y - centre) / np.linalg.norm(y - centre, axis=-1, keepdims=True)
             cosine = (v * normals).sum(axis=-1, keepdims=True)
             across = self.index[k] / self.index[k + 1] * (v - cosine * normals)
             v = across + np.sqrt(1.0 - (across * across).sum(axis=-1, keepdims=True)) * normals
@@ -206,20 +202,6 @@ class PortGeometry:
         ends = y + ((middle - y) @ direction / (v @ direction))[:, None] * v
         area = float(np.linalg.norm(np.cross(ends[0] - ends[2], ends[1] - ends[3]))) / (2.0 * step) ** 2
         return float(self.transmission(x, u)) / area
-
-    def _to_face(self, x: Floats, u: Floats, outward: float) -> Floats:
-        if self.shape == "flat":
-            climb = u @ np.array(self.normal)
-            return (self.distance + outward - x @ np.array(self.normal)) / np.where(climb > 0.0, climb, np.nan)
-        y = x - np.array(self.centre)
-        b = (y * u).sum(axis=-1)
-        return np.sqrt(b * b - (y * y).sum(axis=-1) + (self.radius + outward) ** 2) - b
-
-    def _normals(self, x: Floats) -> Floats:
-        if self.shape == "flat":
-            return np.broadcast_to(np.array(self.normal), x.shape)
-        y = x - np.array(self.centre)
-        return y / np.linalg.norm(y, axis=-1, keepdims=True)
 
     def connect(self, points: ArrayLike, origin: ArrayLike) -> tuple[Floats, Floats, Floats, Floats]:
         """The ways from a point inside to points in the water, `[..., 3]`.

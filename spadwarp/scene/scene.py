@@ -2,33 +2,31 @@
 
 from __future__ import annotations
 
-import contextlib
 import math
 import os
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, Any, Literal, NamedTuple, get_args
+from typing import Any, Literal, get_args
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
-from pydantic import BeforeValidator
 
+from spadwarp.arrays import Floats
 from spadwarp.io.paths import MESH_ENDINGS, example_or_path, used
 from spadwarp.io.text import csv_lines, read_text, read_toml
-from spadwarp.scene.camera import Camera, to_camera, to_world
-from spadwarp.scene.flux import Flux, Sun
+from spadwarp.scene import settings
+from spadwarp.scene.camera import Camera, pixel_directions, to_camera, to_world
 from spadwarp.scene.laser import Laser, detection_efficiency, spectral_lines
-from spadwarp.scene.medium import Medium
+from spadwarp.scene.medium import Medium, phase_function
 from spadwarp.scene.port import Port, PortGeometry
 from spadwarp.scene.pose import rotation_angles, rotation_matrix, turned, unit_vector, vector_of
 from spadwarp.scene.sea import Surface
-from spadwarp.scene.sections import Document, Overrides, listed
-from spadwarp.scene.settings import Analytic, Daylight, Detector, Domain, Gate, Output, Scan, Target, Transport
+from spadwarp.scene.sections import Document, Overrides
 from spadwarp.values import ArgumentError, ConfigError, FileError, Shown, check_integer, check_real, read_real, shown
 
-__all__ = ["Scene", "SceneLike", "Trajectory", "WaterLine", "as_scene", "load_scene", "load_trajectory", "template"]
-__all__ += ["water_lines"]
+__all__ = ["Scene", "SceneLike", "Shots", "Trajectory", "as_scene", "load_scene", "load_trajectory"]
+__all__ += ["shot_at", "shot_scene", "shots_of", "template", "water_lines"]
 
 # What the light has met.
 Component = Literal["ballistic", "forward_scattered", "backscatter", "surface"]
@@ -42,18 +40,18 @@ class Scene(Shown, Document):
     medium: Medium
     laser: Laser = Laser()
     camera: Camera
-    scan: Scan = Scan()
-    detector: Detector = Detector()
-    gate: Gate
+    scan: settings.Scan = settings.Scan()
+    detector: settings.Detector = settings.Detector()
+    gate: settings.Gate
     surface: Surface | None = None
-    daylight: Daylight | None = None
-    targets: Annotated[tuple[Target, ...], BeforeValidator(listed)] = ()
-    domain: Domain = Domain()
-    sun: Sun | None = None
-    flux: Annotated[tuple[Flux, ...], BeforeValidator(listed)] = ()
-    transport: Transport = Transport()
-    output: Output = Output()
-    analytic: Analytic = Analytic()
+    daylight: settings.Daylight | None = None
+    targets: tuple[settings.Target, ...] = ()
+    domain: settings.Domain = settings.Domain()
+    sun: settings.Sun | None = None
+    flux: tuple[settings.Flux, ...] = ()
+    transport: settings.Transport = settings.Transport()
+    output: settings.Output = settings.Output()
+    analytic: settings.Analytic = settings.Analytic()
 
     def _problems(self) -> Iterator[str]:
         try:  # the water that the laser's light meets
@@ -72,7 +70,7 @@ class Scene(Shown, Document):
     def _take_exact_directions(self) -> None:
         """Sets what polarised light, or the surface of a sea, needs where the defaults are without it."""
         medium, transport = self.medium, self.transport
-        if transport.axis_threshold == Transport().axis_threshold:
+        if transport.axis_threshold == settings.Transport().axis_threshold:
             self.__dict__["transport"] = transport.model_copy(update={"axis_threshold": 1.0})
         if self.polarised and medium.scattering_matrix == "none" and medium.range.scattering > 0.0:
             matrix = "rayleigh" if medium.phase_function == "rayleigh" else "voss_fry"
@@ -244,11 +242,10 @@ class Scene(Shown, Document):
             middle = 0.25 * self.medium.pulse_speed * (self.gate.start + self.gate.stop)
             distance = min(np.extract(np.isfinite(ranges), ranges), default=middle)
             directions /= math.sin(0.5 * math.atan2(self.camera.aperture_radius, distance)) ** 2
-        waters = [self.medium]
-        if self.medium.phase_function == "henyey_greenstein":
-            with contextlib.suppress(FileError):  # the file of the cells is gone
-                waters += [self.medium.model_copy(update={"anisotropy": g}) for g in self.medium.range.anisotropies]
-        laws = [law for water in waters for law in water.phase_functions]
+        try:
+            laws = self.medium.phase_functions
+        except FileError:  # the file of the cells is gone
+            laws = [phase_function(self.medium)]
         return max((law.unseen_share(directions) for law in laws), key=lambda found: found[1])
 
     def unseen_warning(self, photons: float, angle: float, unseen: float) -> str:
@@ -282,9 +279,11 @@ class Scene(Shown, Document):
 
     @property
     def tallied_channels(self) -> tuple[str, ...]:
-        """Channels with tallies of their own: of polarised light, or of light at other wavelengths."""
+        """Channels with tallies of their own: of polarised light, but for its intensity, which is the histogram, or of
+        light at other wavelengths."""
+        own = (name for name in self.camera.channels if name != "I")
         others = (one.process for one in self.medium.inelastic)
-        return (*self.camera.tallied_channels, *others, *(f"line {k + 1}" for k in range(len(self.medium.beside))))
+        return (*own, *others, *(f"line {k + 1}" for k in range(len(self.medium.beside))))
 
     @property
     def polarised(self) -> bool:
@@ -367,30 +366,20 @@ def template() -> str:
     return read_text(Path(__file__).with_name("template.toml"))
 
 
-class WaterLine(NamedTuple):
-    """A line of the light that passes the filter, in the water."""
-
-    share: float  # photons, over those of a pulse of one line at `laser.wavelength_nm`
-    extinction: float  # [1/m]
-    scattering: float  # [1/m]
-    speed: float  # of a pulse [m/s]
-
-
-def water_lines(scene: Scene) -> list[WaterLine]:
-    """Lines of a pulse that pass the filter; one line where nothing of the water follows the wavelength.
+def water_lines(scene: Scene) -> list[tuple[float, Medium]]:
+    """Lines of a pulse that pass the filter: their photons, over those of a pulse of one line at `laser.wavelength_nm`,
+    and the medium as they meet it; one line where nothing of the water follows the wavelength.
 
     Raises `FileError` or `ConfigError` for a table, and `ConfigError` for a spectrum beyond where the water is known.
     """
     medium, lines = scene.medium, spectral_lines(scene.laser, scene.detector)
     if len(lines) == 1 or not medium.follows_wavelength:
-        whole = math.fsum(line.share for line in lines)
-        return [WaterLine(whole, medium.extinction, medium.scattering, medium.pulse_speed)]
+        return [(math.fsum(line.share for line in lines), medium)]
     try:
-        waters = [(line.share, medium.at_wavelength(line.wavelength_nm)) for line in lines]
+        return [(line.share, medium.at_wavelength(line.wavelength_nm)) for line in lines]
     except ArgumentError as error:
         text = "laser: the spectrum reaches beyond where medium.chlorophyll, temperature and salinity hold"
         raise ConfigError(f"{text}: {error}", source=scene.source) from None
-    return [WaterLine(share, water.extinction, water.scattering, water.pulse_speed) for share, water in waters]
 
 
 def camera_port(scene: Scene) -> PortGeometry | None:
@@ -429,8 +418,12 @@ def mean_plane(scene: Scene, *, from_below: bool = False) -> PortGeometry:
 
 
 def _placed(scene: Scene, port: Port, origin: Any, normal: Any) -> PortGeometry:
+    """A port with its lengths from an origin, and its normal, in the frame of the camera."""
     water = scene.medium.phase_index, scene.medium.group_index
-    return port.placed(origin, normal, wavelength_nm=scene.laser.wavelength_nm, water=water)
+    index, group_index = zip(*port.indices(scene.laser.wavelength_nm), water, strict=True)
+    distance, radius = (port.distance or 0.0) + float(origin @ normal), port.radius or 0.0
+    ends = vector_of(normal), vector_of(origin + port.offset)
+    return PortGeometry(port.shape, distance, ends[0], radius, ends[1], port.thickness, index, group_index)
 
 
 # Scenes that move
@@ -510,3 +503,130 @@ def load_trajectory(path: str | os.PathLike[str]) -> Trajectory:
             raise ValueError("no row of numbers")
     table = np.array(rows, np.float64)
     return Trajectory(times=table[:, 0], fields=names[1:], values=table[:, 1:], source=str(Path(path)))
+
+
+# Scans along a trajectory: when and where each shot is, and what it sees
+
+_POSE = tuple(f"camera.{name}[{axis}]" for name in ("position", "rotation_deg") for axis in range(3))
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class Shots:
+    """The shots of a scan along a trajectory, in the order of its image's rows; R points of a receiver each."""
+
+    time: Floats  # of each shot from the first one on [s], `[N]`
+    position: Floats  # of the lens in the world [m], `[N, 3]`
+    rotation: Floats  # axes of camera and laser in the world, as columns, `[N, 3, 3]`
+    view: Floats  # unit vectors of the receiver's pixels in the camera's frame, `[R, 3]`
+    shape: tuple[int, int]  # of the image: N·R pixels
+
+    def __len__(self) -> int:
+        return len(self.time)
+
+    @property
+    def number(self) -> NDArray[np.int64]:
+        """The shot of each pixel, `[H, W]`."""
+        return np.repeat(np.arange(len(self)), len(self.view)).reshape(self.shape)
+
+    def lines(self) -> tuple[Floats, Floats]:
+        """Where each pixel's line of sight begins in the world [m], and its unit vector, both `[H, W, 3]`."""
+        start = np.repeat(self.position, len(self.view), axis=0)
+        along = np.einsum("nij,rj->nri", self.rotation, self.view)
+        return start.reshape(*self.shape, 3), along.reshape(*self.shape, 3)
+
+    def aside(self, point: Floats) -> Floats:
+        """By how far the axis of each shot passes a point of the world [m], `[N]`."""
+        to_point, axis = point - self.position, self.rotation[:, :, 2]
+        along = np.maximum((to_point * axis).sum(axis=1), 0.0)
+        return np.linalg.norm(to_point - along[:, None] * axis, axis=1)
+
+
+def shots_of(scene: Scene) -> Shots:
+    """When and where each shot of a scan along a trajectory is.
+
+    A shot takes `detector.pulses_per_frame` pulses. The platform flies by `scan.velocity`, or as the file `scan.path`
+    says: linear in between, attitudes by the shortest turn. The pattern turns the camera's axis in the plane of both
+    directions, without a turn of the image about it.
+
+    Raises `ArgumentError`: the scene has no such scan; `FileError` or `ConfigError`: the file of the trajectory cannot
+    be read, holds another field than the camera's pose, or ends before the last shot.
+    """
+    if scene.scan.mode != "trajectory":
+        raise ArgumentError(f"scan.mode = {scene.scan.mode!r}; 'trajectory' is needed")
+    count, camera = scene.scan_positions, scene.camera
+    time: Floats = np.arange(count, dtype=np.float64) * (scene.detector.pulses_per_frame / scene.laser.repetition_rate)
+    if scene.scan.path is None:
+        position = np.asarray(camera.position) + time[:, None] * np.asarray(scene.scan.velocity)
+        platform = np.broadcast_to(rotation_matrix(camera.rotation_deg), (count, 3, 3))
+    else:
+        position, platform = _platform(scene, time)
+    return Shots(
+        time=time,
+        position=position,
+        rotation=platform @ _deflections(scene, count),
+        view=pixel_directions(scene.receiver)[0],
+        shape=(camera.height, camera.width),
+    )
+
+
+def _platform(scene: Scene, time: Floats) -> tuple[Floats, Floats]:
+    """Positions and attitudes by the file of a trajectory; what it lacks is the camera's own."""
+    flown = load_trajectory(str(scene.scan.path))
+    if other := [name for name in flown.fields if name not in _POSE]:
+        raise ConfigError(f"{other[0]} is no part of the camera's pose: {', '.join(_POSE)}", source=flown.source)
+    at, last = flown.times[0] + time, float(flown.times[0] + time[-1])
+    if last > flown.times[-1]:
+        text = f"time = {flown.times[-1]:g} is the last, and the last shot is at {last:g} s"
+        raise ConfigError(text, source=flown.source)
+    columns = dict(zip(flown.fields, flown.values.T, strict=True))
+    own = dict(zip(_POSE, (*scene.camera.position, *scene.camera.rotation_deg), strict=True))
+    pose = np.stack([columns.get(name, np.full(len(flown), own[name])) for name in _POSE], axis=1)
+    position = np.stack([np.interp(at, flown.times, values) for values in pose[:, :3].T], axis=1)
+    return position, turned(at, flown.times, pose[:, 3:])
+
+
+def _deflections(scene: Scene, count: int) -> Floats:
+    """Rotations from the frame of each shot to that of the platform, `[N, 3, 3]`."""
+    scan, width = scene.scan, scene.camera.width
+    turn = np.arange(count) / width  # rows that have gone by
+    azimuth, edge = 2.0 * math.pi * turn, math.tan(math.radians(scan.half_angle_deg))
+    x, y = np.zeros(count), np.zeros(count)
+    if scan.pattern == "raster":
+        part = 2.0 * (np.arange(count) % width + 0.5) / width - 1.0
+        x = np.tan(math.radians(scan.half_angle_deg) * part)
+    elif scan.pattern in ("conical", "elliptic"):
+        along = scan.half_angle_deg if scan.pattern == "conical" else scan.half_angle_y_deg
+        x, y = edge * np.cos(azimuth), math.tan(math.radians(along)) * np.sin(azimuth)
+    elif scan.pattern == "rosette":
+        other = -scan.rosette_ratio * azimuth
+        x, y = (0.5 * edge * (of(azimuth) + of(other)) for of in (np.cos, np.sin))
+    axis = np.stack([x, y, np.ones(count)], axis=1)
+    axis /= np.linalg.norm(axis, axis=1, keepdims=True)
+    # By Rodrigues' formula about z × axis, of sine |z × axis| and cosine axis_z.
+    cross = np.zeros((count, 3, 3))
+    cross[:, 0, 2], cross[:, 1, 2] = axis[:, 0], axis[:, 1]
+    cross -= cross.transpose(0, 2, 1)
+    return np.eye(3) + cross + cross @ cross / (1.0 + axis[:, 2, None, None])
+
+
+def shot_scene(scene: Scene, shot: int) -> Scene:
+    """The scene of one shot alone: laser and camera stand where they are then.
+
+    Raises `ArgumentError` for a shot that there is not, and what `shots_of` raises.
+    """
+    shots = shots_of(scene)
+    at = check_integer("shot", shot, f"[0, {len(shots) - 1}]")
+    receiver = scene.receiver
+    pose = {"position": vector_of(shots.position[at]), "rotation_deg": rotation_angles(shots.rotation[at])}
+    size = {"width": receiver.width, "height": 1}
+    return scene.with_overrides({"camera": {**size, **pose}, "scan": dict.fromkeys(type(scene.scan).model_fields)})
+
+
+def shot_at(scene: Scene, points: Sequence[Floats]) -> Scene:
+    """The scene of the shot, alone and with its part of the photons, whose axis passes nearest to one of some points of
+    the world; without points the first."""
+    shots, photons = shots_of(scene), scene.transport.photons
+    passes = [shots.aside(point) for point in points] or [np.zeros(len(shots))]
+    best = min((aside.min(), int(aside.argmin())) for aside in passes)[1]
+    share = photons if isinstance(photons, str) else max(photons // scene.scan_positions, 1)
+    return shot_scene(scene, best).with_overrides({"transport.photons": share})

@@ -31,16 +31,13 @@ _NODES_OF_A_WAVE = 4.0
 class Waves(Section):
     """Resolved waves: a periodic field of heights, drawn from a spectrum or read from a file."""
 
-    section: ClassVar[str] = "surface.waves"
-    size: float = field(
-        20.0, "period of the field along the waves, and across them unless heights has it [m]", "[0.1, 1e5]"
-    )
+    size: float = Field(20.0, ge=0.1, le=1e5)
+    """period of the field along the waves, and across them unless heights has it [m]"""
     cells: Whole = field(512, "nodes of the field along each side, for a spectrum", "[8, 8192]")
     spectrum: Literal["jonswap"] = field("jonswap", "of the waves that surface.wind makes (Hasselmann et al. 1973)")
     fetch: float = field(10e3, "length of sea over which the wind blows [m]", "[10, 1e7]")
-    spreading: float = field(
-        10.0, "s of the distribution cos^2s(θ/2) of directions; large: one direction", "[0.5, 200]"
-    )
+    spreading: float = Field(10.0, ge=0.5, le=200)
+    """s of the distribution cos^2s(θ/2) of directions; large: one direction"""
     direction: Direction | None = field(None, "in which the waves go, in the world; default: surface.direction, or any")
     shortest: float | None = Field(None, ge=1e-3, le=1e4)
     """length of the shortest waves [m]; default: four nodes, or more until facets keep a quarter of the slopes"""
@@ -49,10 +46,8 @@ class Waves(Section):
     heights: Annotated[str | None, FilePath(".npy")] = field(None, "heights [rows, columns] in place of a spectrum [m]")
 
     def _problems(self) -> Iterator[str]:
-        if self.heights is not None:
-            for name in ("cells", "fetch", "spreading", "shortest", "seed", "time"):
-                if getattr(self, name) != type(self).model_fields[name].default:
-                    yield f"{name} is of a spectrum, which heights takes the place of"
+        of_spectrum = "cells", "fetch", "spreading", "shortest", "seed", "time"
+        yield from self._only_with("a spectrum, in place of heights,", self.heights is None, *of_spectrum)
         if self.shortest is not None and self.shortest < 2.0 * self.size / self.cells:
             yield f"shortest = {self.shortest} m is less than two nodes, {2.0 * self.size / self.cells:.4g} m"
 
@@ -72,26 +67,20 @@ class Surface(Section):
     air_index: float | None = field(None, "phase index of the air; default: that of dry air", "[1, 1.2]")
     air_group_index: float | None = field(None, "group index of the air; default: dry air's, or air_index", "[1, 1.2]")
     air_extinction: float = field(0.0, "of the air, whose scattered light is lost [1/m]", "[0, 100]")
-    waves: Waves | None = None
-    """resolved waves; facets are about those then, with the slopes that they leave"""
+    waves: Waves | None = field(None, "resolved waves; facets are about those then, with the slopes that they leave")
 
     def _problems(self) -> Iterator[str]:
         if (self.wind is None) == (self.mean_square_slope is None):
             yield "needs either wind or mean_square_slope"
         yield from self._only_with("wind", self.wind is not None, "direction")
         yield from self._only_with("air_index", self.air_index is not None, "air_group_index")
-        if self.direction is not None:
-            cosine = np.dot(unit_vector(self.direction), unit_vector(self.up))
-            if abs(cosine) > 0.999:
-                yield self._that("direction", "is that of up: a wind blows along the sea")
-        if self.waves is not None:
-            yield from self._problems_of_waves(self.waves)
-
-    def _problems_of_waves(self, waves: Waves) -> Iterator[str]:
-        if waves.direction is not None:
-            cosine = np.dot(unit_vector(waves.direction), unit_vector(self.up))
-            if abs(cosine) > 0.999:
-                yield f"waves.direction = {waves.direction} is that of up: waves go along the sea"
+        waves = self.waves
+        ways = {"direction": self.direction, "waves.direction": None if waves is None else waves.direction}
+        for name, direction in ways.items():
+            if direction is not None and abs(np.dot(unit_vector(direction), self.normal)) > 0.999:
+                yield f"{name} = {list(direction)} is that of up: wind and waves go along the sea"
+        if waves is None:
+            return
         if self.wind == 0.0 or self.mean_square_slope == 0.0:
             yield "waves need wind or mean_square_slope > 0"
         elif waves.heights is None and self.wind is None:

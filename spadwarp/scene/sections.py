@@ -50,7 +50,6 @@ Overrides = Mapping[str, Any] | Sequence[str]
 FileName = str | os.PathLike[str]
 
 _NUMBER = re.compile(r"\s*[+-]?\.?\d")
-_WITHOUT_UNIT = re.compile(r"^(\w+) = .*? is outside [\[(][^\])]*[\])](?=,|;|$)")
 
 
 class FilePath(NamedTuple):
@@ -77,23 +76,9 @@ def field(default: Any, text: str, within: str | None = None) -> Any:
     return Field(default, description=text, allow_inf_nan=math.inf in limits.values() or None, **limits)
 
 
-def listed(value: Any) -> Any:
-    """TOML has lists; what is frozen holds tuples."""
-    return tuple(value) if isinstance(value, list) else value
-
-
-def _whole(value: Any) -> Any:
-    """TOML writes 2e9 as a float; a whole one is as good as an integer."""
-    return int(value) if isinstance(value, float) and value.is_integer() else value
-
-
-def _from_one(count: int) -> BeforeValidator:
+def from_one(count: int) -> BeforeValidator:
     """One number stands for as many."""
-
-    def repeated(value: Any) -> Any:
-        return (value,) * count if isinstance(value, int | float) and not isinstance(value, bool) else listed(value)
-
-    return BeforeValidator(repeated)
+    return BeforeValidator(lambda value: (value,) * count if type(value) in (int, float) else value)
 
 
 def _with_length(vector: tuple[float, ...]) -> tuple[float, ...]:
@@ -102,19 +87,20 @@ def _with_length(vector: tuple[float, ...]) -> tuple[float, ...]:
     return vector
 
 
-Whole = Annotated[int, BeforeValidator(_whole)]
+# TOML writes 2e9 as a float; a whole one is as good as an integer.
+Whole = Annotated[int, BeforeValidator(lambda x: int(x) if isinstance(x, float) and x.is_integer() else x)]
 # Every number has a range in which products of several stay within single precision.
 Coordinate = Annotated[float, Field(ge=-1e9, le=1e9)]
-Vector = Annotated[tuple[Coordinate, Coordinate, Coordinate], BeforeValidator(listed)]
+Vector = tuple[Coordinate, Coordinate, Coordinate]
 Direction = Annotated[Vector, AfterValidator(_with_length)]
 Infinite = BeforeValidator(lambda value: math.inf if value == "infinity" else value)
 Bound = Annotated[float, Field(ge=-math.inf, le=math.inf, allow_inf_nan=True)]
-Corner = Annotated[tuple[Bound, Bound, Bound], _from_one(3)]
-Scale = Annotated[tuple[Coordinate, Coordinate, Coordinate], _from_one(3)]
-_UP_TO_THREE = _from_one(1), Field(min_length=1, max_length=3)
+Corner = Annotated[tuple[Bound, Bound, Bound], from_one(3)]
+Scale = Annotated[Vector, from_one(3)]
+_UP_TO_THREE = from_one(1), Field(min_length=1, max_length=3)
 Size = Annotated[tuple[Annotated[float, Field(ge=1e-9, le=1e9)], ...], *_UP_TO_THREE]
 Counts = Annotated[tuple[Annotated[int, Field(ge=1, le=1024)], ...], *_UP_TO_THREE]
-AnyFile = Annotated[str | None, FilePath()]
+File = Annotated[str | None, FilePath()]
 CsvFile = Annotated[str | None, FilePath(".csv")]
 
 
@@ -193,12 +179,7 @@ class Section(_Model):
     """
 
     model_config = ConfigDict(
-        defer_build=True,
-        frozen=True,
-        extra="forbid",
-        strict=True,
-        allow_inf_nan=False,
-        protected_namespaces=(),
+        defer_build=True, frozen=True, extra="forbid", strict=True, allow_inf_nan=False, protected_namespaces=()
     )
     section: ClassVar[str] = ""
     """Whose presets it takes."""
@@ -232,11 +213,11 @@ class Section(_Model):
     @field_validator("*", mode="before")
     @classmethod
     def _read(cls, value: Any, info: ValidationInfo) -> Any:
-        """Numbers with a unit as numbers; names of presets and endings of files are checked."""
+        """Numbers with a unit as numbers, TOML's lists as tuples; names of presets and endings of files are checked."""
         name = info.field_name or ""
         value = in_field_unit(value, field := cls.model_fields[name])
         if not isinstance(value, str):
-            return value
+            return tuple(value) if isinstance(value, list) else value
         if name == "preset" and value not in PRESETS[cls.section]:
             raise ValueError("preset", tuple(PRESETS[cls.section]))
         path = file_path(field)
@@ -295,20 +276,15 @@ class Section(_Model):
     @model_validator(mode="after")
     def _consistent(self) -> Self:
         for problem in self._problems():
-            raise ValueError(_WITHOUT_UNIT.sub(self._with_unit, problem))
+            raise ValueError(problem)
         return self
-
-    def _with_unit(self, found: re.Match[str]) -> str:
-        info = type(self).model_fields.get(found[1])
-        unit = None if info is None else field_unit(info)
-        return found[0] if unit in (None, "1") else f"{found[0]} {unit}"
 
     def _problems(self) -> Iterator[str]:
         """Why fields exclude each other; where they do not, sets what follows from those that were given."""
         yield from ()
 
     def _that(self, name: str, reason: str) -> str:
-        """A problem of a field: `half_angle_deg = 95.0 is outside (0, 90)`."""
+        """A problem of a field: `half_angle_deg = 95.0 is outside (0, 90) °`."""
         value = getattr(self, name)
         return f"{name} = {list(value) if isinstance(value, tuple) else value!r} {reason}"
 
@@ -372,16 +348,16 @@ def parts_of(annotation: Any) -> Iterator[Any]:
         yield from parts_of(part)
 
 
-def models_of(annotation: Any) -> list[type[BaseModel]]:
-    """Models of the tables that an annotation names."""
-    return [part for part in parts_of(annotation) if isinstance(part, type) and issubclass(part, BaseModel)]
+def table_in(annotation: Any) -> type[Section] | None:
+    """The model of the table, or of the tables of the list, that an annotation names."""
+    parts = parts_of(annotation)
+    return next((part for part in parts if isinstance(part, type) and issubclass(part, Section)), None)
 
 
 @cache
 def table_of(model: type[BaseModel], name: str) -> type[Section] | None:
-    """The model of a field's table, or of the tables of its list."""
-    info = model.model_fields.get(name)
-    return next((one for one in models_of(info) if issubclass(one, Section)), None)
+    """The same of a field."""
+    return table_in(model.model_fields.get(name))
 
 
 def field_unit(info: FieldInfo) -> str | None:
@@ -390,12 +366,6 @@ def field_unit(info: FieldInfo) -> str | None:
         return None
     bracketed = re.findall(r"\[([^\]]+)\]", info.description or "")
     return next((unit for unit in bracketed if unit in UNITS), None if bracketed else "1")
-
-
-def takes_integers(info: FieldInfo) -> bool:
-    """Whether a field's numbers are whole."""
-    parts = list(parts_of(info))
-    return any(part is int for part in parts) and not any(part is float for part in parts)
 
 
 def in_field_unit(value: Any, info: FieldInfo) -> Any:
@@ -731,7 +701,10 @@ def describe(error: ValidationError, model: type[BaseModel], overrides: Mapping[
     problems = error.errors(include_url=False)
     located = [(*locate(model, problem["loc"]), problem) for problem in problems[:_MOST]]
     values = [key for key, _, problem in located if problem["type"] != "literal_error"]  # which count, not the words
+    lists = {key[:-1] for key, _, _ in located}  # without their wrong items they may seem too short
     for key, info, problem in located:
+        if problem["type"] == "too_short" and key in lists:
+            continue
         if problem["type"] != "literal_error" or not any(one[: len(key)] == key for one in values):
             lines.setdefault(key, _line(key, info, problem, model, _is_overridden(key, overrides)))
     more = [f"{len(problems) - _MOST} more problems"] if len(problems) > _MOST else []
@@ -749,7 +722,7 @@ def locate(model: type[BaseModel], loc: Sequence[str | int]) -> tuple[Key, Field
         elif inner is not None and not part.startswith(("literal[", "function-")):
             key.append(part)
             info = inner.model_fields.get(part)
-            inner = next(iter(models_of(info)), None) if info is not None else None
+            inner = table_of(inner, part)
     return tuple(key), info
 
 
@@ -770,7 +743,7 @@ def _line(key: Key, info: FieldInfo | None, problem: Any, model: type[BaseModel]
     kind, value, whole = problem["type"], problem["input"], model
     if kind == "extra_forbidden":
         for part in (part for part in key[:-1] if isinstance(part, str)):
-            model = models_of(model.model_fields[part])[0]
+            model = table_of(model, part) or model
         word, siblings = str(key[-1]), list(model.model_fields)
         meant = _SYNONYMS.get(word)
         near = f"; did you mean {meant!r}?" if meant in siblings else suggestion(word, siblings)
@@ -842,13 +815,14 @@ def _instead(key: Key, info: FieldInfo | None, kind: str, value: Any) -> str:
         return f" of tables; write [[{key_text(key)}]]"
     if kind == "tuple_type" and isinstance(value, str) and not {float, int} & set(parts_of(info)):
         return f"; write [{value!r}]"
-    models = models_of(info) if kind.startswith("model") else []
-    if not models:
+    table = table_in(info) if kind.startswith("model") else None
+    if table is None:
         return _factor(key, value)
     if not isinstance(value, str):
-        fields, once = list(models[0].model_fields), f", of which there is one; write [{key_text(key)}]"
-        return once if isinstance(value, list) else f" of {', '.join(fields[:8])}{', ...' * (len(fields) > 8)}"
-    known = list(PRESETS.get(getattr(models[0], "section", ""), {}))
+        fields, once = list(table.model_fields), f", of which there is one; write [{key_text(key)}]"
+        return once if isinstance(value, list | tuple) else f" of {', '.join(fields[:8])}{', ...' * (len(fields) > 8)}"
+    known = list(PRESETS.get(table.section, {}))
     if value in known:
         return f'; a preset is taken by {{preset = "{value}"}}'
-    return suggestion(value, known) or ("" if len(known) > 8 else f"; presets are {', '.join(map(repr, known))}")
+    listed = f"; presets are {', '.join(map(repr, known))}" if 0 < len(known) < 9 else ""
+    return suggestion(value, known) or listed

@@ -19,8 +19,7 @@ from spadwarp.scene.camera import Camera, pixel_directions, to_camera, to_world
 from spadwarp.scene.laser import Laser, profile_axes, profile_extent
 from spadwarp.scene.port import PortGeometry
 from spadwarp.scene.pose import rotation_matrix, vector_of
-from spadwarp.scene.scan import shots_of
-from spadwarp.scene.scene import Scene, camera_port, laser_port
+from spadwarp.scene.scene import Scene, camera_port, laser_port, shots_of
 from spadwarp.scene.sea import Surface
 from spadwarp.values import path_from_time
 
@@ -28,14 +27,6 @@ from spadwarp.values import path_from_time
 _LEAST = 1e-9
 _STEPS = 30
 _GAUSSIAN_EDGE = 1.5  # tan of the outermost angle over tan θ: holds 98.9 % of a gaussian beam
-
-
-def view_directions(scene: Scene) -> Floats:
-    """As `pixel_directions` of a scene's camera; of a scan along a trajectory in the frame of each shot."""
-    if scene.scan.mode != "trajectory":
-        return pixel_directions(scene.camera)
-    size = (scene.camera.height, scene.camera.width, 3)
-    return np.broadcast_to(pixel_directions(scene.receiver), size)
 
 
 def scan_axes(scene: Scene) -> Floats:
@@ -90,10 +81,6 @@ class LinesOfSight:
         pose = None if self.pose is None else (self.pose[0][index], self.pose[1][index])
         return LinesOfSight(*lines, self.laser, self.laser_port, pose, self.open)
 
-    def flat(self) -> LinesOfSight:
-        """The lines of all pixels in one row, `[P, 3]`."""
-        return self[np.unravel_index(np.arange(self.lead.size), self.lead.shape)]
-
     def points(self, distance: ArrayLike) -> Floats:
         """Points in the camera frame at ranges [m]."""
         distance = np.asarray(distance, np.float64)
@@ -111,10 +98,7 @@ class LinesOfSight:
 
     def depth_from_range(self, distance: Any) -> Any:
         """Depth z [m]."""
-        depth = self.start[..., 2] + (distance - self.lead) * self.direction[..., 2]
-        if self.open:
-            depth = np.where(distance < self.lead, distance / self.lead * self.start[..., 2], depth)
-        return depth
+        return self.points(distance)[..., 2]
 
     def range_from_depth(self, depth: Any) -> Any:
         """Range [m] at planar depths."""
@@ -195,7 +179,8 @@ def lines_of_sight(scene: Scene, view: Floats | None = None) -> LinesOfSight:
         shots = shots_of(scene)
         axes = (rotation_matrix(scene.camera.rotation_deg).T @ shots.rotation)[shots.number]
         pose = axes, to_camera(scene.camera, shots.position)[shots.number]
-    view = view_directions(scene) if view is None else view
+    if view is None:  # of a scan along a trajectory in the frame of each shot
+        view = np.broadcast_to(pixel_directions(scene.receiver), (scene.camera.height, scene.camera.width, 3))
     if port is None:
         lines = _in_water(view)
     elif pose is None:
@@ -315,20 +300,6 @@ def _cut(triangles: Floats, plane: Floats) -> Floats:
     return np.concatenate(parts)
 
 
-def nearest_points(triangles: Floats, point: Floats) -> Floats:
-    """The point of each triangle that is nearest to a point, `[N, 3]`."""
-    corners = triangles - point
-    edges = np.roll(corners, -1, axis=1) - corners
-    along = -(corners * edges).sum(axis=2) / np.maximum((edges**2).sum(axis=2), 1e-300)
-    on_edges = corners + along.clip(0.0, 1.0)[..., None] * edges
-    nearest = (on_edges**2).sum(axis=2).argmin(axis=1)
-    normal = np.cross(edges[:, 0], edges[:, 1])
-    foot = normal * ((normal * corners[:, 0]).sum(axis=1) / np.maximum((normal**2).sum(axis=1), 1e-300))[:, None]
-    sides = (np.cross(edges, foot[:, None] - corners) * normal[:, None]).sum(axis=2)
-    within = (sides > 0.0).all(axis=1, keepdims=True)
-    return np.where(within, foot, on_edges[np.arange(len(nearest)), nearest]) + point
-
-
 def within_port(scene: Scene, triangles: Floats) -> tuple[str, str] | None:
     """What is in the housing or the window of the camera's port and is not meant for it, a laser that shines through no
     port, or parts of triangles: the field, and a text about it."""
@@ -350,7 +321,9 @@ def within_port(scene: Scene, triangles: Floats) -> tuple[str, str] | None:
         planes = np.vstack([view_planes(camera), [*(-np.array(port.normal)), port.nearest - 2e-6]])
         inside = points_inside(triangles, planes)
     else:
-        found = nearest_points(triangles, np.array(port.centre))
+        from trimesh.triangles import closest_point
+
+        found = closest_point(triangles, np.broadcast_to(port.centre, (len(triangles), 3)))
         outer = (port.radius + port.thickness) * (1.0 - 1e-6)
         inside = found[np.linalg.norm(found - port.centre, axis=1) < outer]
     if not len(inside):

@@ -16,15 +16,13 @@ import spadwarp_kernels as sk
 from spadwarp.device import physical_memory, pick_device
 from spadwarp.mesh import TriangleMesh, build_mesh, focus_distance
 from spadwarp.result import Truth
-from spadwarp.scene import Camera, Laser, Scene, SceneLike, as_scene, phase_function, scattering_matrix
+from spadwarp.scene import Camera, Laser, Scene, SceneLike, Sun, as_scene, phase_function, scattering_matrix
 from spadwarp.scene.camera import pixel_directions, pixel_views, to_camera, to_world, view_box
-from spadwarp.scene.flux import Sun
 from spadwarp.scene.laser import load_profile, profile_extent
 from spadwarp.scene.medium import MIXTURE, cell_shares, constituent_order, grid_cells
 from spadwarp.scene.port import PortGeometry
 from spadwarp.scene.pose import rotation_matrix, sideways, vector_of
-from spadwarp.scene.scan import Shots, shots_of
-from spadwarp.scene.scene import camera_port, laser_port, mean_plane
+from spadwarp.scene.scene import Shots, camera_port, laser_port, mean_plane, shots_of
 from spadwarp.scene.sight import lines_of_sight, scan_axes, within_port
 from spadwarp.transport.derivatives import derivative_kinds, make_derivatives
 from spadwarp.transport.plan import tally_limits

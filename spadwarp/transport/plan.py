@@ -5,7 +5,6 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
-from functools import partial
 from pathlib import Path
 from typing import Any, Literal, NamedTuple
 
@@ -21,10 +20,9 @@ from spadwarp.result.result import ResultHead
 from spadwarp.scene import Laser, Scene, Transport
 from spadwarp.scene.camera import to_camera
 from spadwarp.scene.laser import load_profile, profile_extent
-from spadwarp.scene.scan import shots_of
-from spadwarp.scene.scene import camera_port
+from spadwarp.scene.scene import camera_port, shots_of
 from spadwarp.scene.sections import field_range
-from spadwarp.scene.sight import nearest_points, view_planes
+from spadwarp.scene.sight import view_planes
 from spadwarp.transport.derivatives import resolve_derivatives
 from spadwarp.values import SEED, ConfigError, check_integer, check_part, check_real
 
@@ -269,22 +267,16 @@ def tally_limits(scene: Scene, mesh: TriangleMesh | None) -> TallyLimits:
 Density = Callable[[NDArray[np.float64]], NDArray[np.float64]]
 
 
-def _own_anisotropies(scene: Scene) -> list[float]:
-    """Of layers and cells that share the phase function's form alone."""
-    return [] if scene.medium.has_phase_table else list(scene.medium.range.anisotropies)
-
-
 def _phase_density(scene: Scene) -> Density:
     """Largest density [1/sr] of the phase functions of a scene's waters over t = 1 - cos(angle) in (0, 2]."""
-    laws: list[Density] = [law.over_t for law in scene.medium.phase_functions]
-    laws += [partial(sk.henyey_greenstein_density, g=g) for g in _own_anisotropies(scene)]
-    return lambda t: np.max([law(t) for law in laws], axis=0)
+    laws = scene.medium.phase_functions
+    return lambda t: np.max([law.over_t(t) for law in laws], axis=0)
 
 
 def _backward(scene: Scene, density: Density) -> float:
     """Density [1/sr] with which light is thrown back: the largest of the phase function beyond 90°, or what many
     small deflections come to, isotropic scattering of (1 - <cos>) times the light."""
-    turned = 1.0 - min([*(law.mean_cosine for law in scene.medium.phase_functions), *_own_anisotropies(scene)])
+    turned = 1.0 - min(law.mean_cosine for law in scene.medium.phase_functions)
     return max(float(density(np.linspace(1.0, 2.0, 181)).max()), turned / (4.0 * math.pi))
 
 
@@ -371,13 +363,15 @@ def _lens_positions(scene: Scene) -> NDArray[np.float64]:
 
 def _distance(point: NDArray[np.float64], mesh: TriangleMesh) -> float:
     """From a point to the nearest face [m]."""
+    from trimesh.triangles import closest_point
+
     vertices, faces = mesh.vertices - point.astype(np.float32), mesh.faces
     nearest = (vertices**2).sum(axis=1).min()
     corners = [vertices[faces[:, k]] for k in range(3)]
     # The boxes about the faces leave few of them.
     box = np.maximum(np.minimum.reduce(corners), -np.maximum.reduce(corners)).clip(min=0.0)
     near = vertices[faces[(box**2).sum(axis=1) <= 1.001 * nearest]].astype(np.float64)
-    return float(np.linalg.norm(nearest_points(near, np.zeros(3)), axis=1).min())
+    return float(np.linalg.norm(closest_point(near, np.zeros((len(near), 3))), axis=1).min())
 
 
 def _spread(laser: Laser) -> float:

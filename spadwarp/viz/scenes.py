@@ -13,8 +13,7 @@ from matplotlib.cm import ScalarMappable
 from matplotlib.colors import LinearSegmentedColormap, Normalize, to_rgb
 
 from spadwarp.arrays import Floats
-from spadwarp.dataset import FrameReader
-from spadwarp.dataset.recipe import SPLITS
+from spadwarp.dataset import SPLITS, FrameReader
 from spadwarp.mesh import SIZED_BUILTINS, MeshSummary, TriangleMesh, build_mesh, builtin_names, make_builtin
 from spadwarp.scene import Scene
 from spadwarp.scene.camera import to_camera, to_world

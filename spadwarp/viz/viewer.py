@@ -20,8 +20,7 @@ from numpy.typing import NDArray
 from spadwarp.arrays import block_sums
 from spadwarp.files import Held, load, sequence
 from spadwarp.files.formats import FrameSequence
-from spadwarp.frames import FramesFile, InstrumentResponse, detector_response
-from spadwarp.frames.file import SequenceFile
+from spadwarp.frames import FramesFile, InstrumentResponse, SequenceFile, detector_response
 from spadwarp.io.paths import atomic_path, check_apart
 from spadwarp.result import Channel, Result, analyser_channel
 from spadwarp.result.analysis import noise_caption

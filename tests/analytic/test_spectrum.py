@@ -54,8 +54,8 @@ def test_arrival_is_the_mean_of_the_group_delays():
     scene = spadwarp.load_scene("plane_5m", {"medium": {"chlorophyll": 0.1}, "laser.linewidth_nm": 40.0})
     lines = spadwarp.scene.water_lines(scene)
     path = np.hypot(5.0, np.linalg.norm(scene.beam.position)) + 5.0
-    weights = [line.share * math.exp(-line.extinction * path) for line in lines]
-    mean = np.average([path / line.speed for line in lines], weights=weights)
+    weights = [share * math.exp(-water.extinction * path) for share, water in lines]
+    mean = np.average([path / water.pulse_speed for _, water in lines], weights=weights)
     assert on_axis(scene, 5.0)["arrival"][0] == pytest.approx(mean, rel=1e-7)
 
 

@@ -9,7 +9,7 @@ import pytest
 import spadwarp
 from helpers.scenes import scene as make_scene
 from spadwarp.scene import Camera, Gate, Laser, Medium, Scene
-from spadwarp.scene.sections import field_unit, models_of
+from spadwarp.scene.sections import field_unit, table_of
 from spadwarp.values import percent, quantity, with_prefix
 
 QUANTITIES = {
@@ -81,13 +81,12 @@ def test_every_field_with_a_suffix_has_that_unit():
     """The docstring's unit is the one that converts; a wrong one would be a wrong number."""
     suffixes = {"ps": "ps", "ns": "ns", "um": "µm", "nm": "nm", "deg": "°"}
     found = 0
-    for section in Scene.model_fields.values():
-        for model in models_of(section):
-            for name, info in model.model_fields.items():
-                suffix = name.rsplit("_", 1)[-1]
-                if suffix in suffixes:
-                    assert field_unit(info) == suffixes[suffix], name
-                    found += 1
+    for section in Scene.model_fields:
+        for name, info in table_of(Scene, section).model_fields.items():
+            suffix = name.rsplit("_", 1)[-1]
+            if suffix in suffixes:
+                assert field_unit(info) == suffixes[suffix], name
+                found += 1
     assert found > 12
 
 

@@ -11,7 +11,7 @@ from spadwarp.dataset.recipe import Recipe
 from spadwarp.denoise.recipe import TrainingRecipe
 from spadwarp.scene import Medium, Scene, parse_override, presets
 from spadwarp.scene.medium import Constituent
-from spadwarp.scene.sections import interval_of, models_of, parts_of
+from spadwarp.scene.sections import interval_of, parts_of, table_of
 from spadwarp.values import SPEED_OF_LIGHT, ConfigError
 
 coefficients = st.floats(1e-6, 1e3)
@@ -165,10 +165,9 @@ def test_derived_quantities():
 def number_fields(model, path=""):
     """Every field that takes numbers, with its range."""
     for name, info in model.model_fields.items():
-        inner = models_of(info)
-        for one in inner:
-            yield from number_fields(one, f"{path}{name}.")
-        if not inner and any(part in (int, float) for part in parts_of(info)):
+        if inner := table_of(model, name):
+            yield from number_fields(inner, f"{path}{name}.")
+        elif any(part in (int, float) for part in parts_of(info)):
             yield f"{path}{name}", info
 
 

@@ -29,10 +29,13 @@ BOTTOM = {"builtin": "plane", "size": [40.0, 40.0], "translation": [0.0, 0.0, 8.
         ({**BAY, "scan": {"mode": "confocal"}}, "scan.mode = 'confocal': cannot be combined with surface"),
         ({**BAY, "medium": {"grid": {"shape": "plume", "extinction": 1.0, "size": 1.0}}}, "medium.grid, a table"),
         ({"surface": {"point": [0.0, 0.0, 3.0], "up": [0.0, 0.0, 1.0], "preset": "calm"}}, "outside_index"),
-        ({"surface": {**BAY["surface"], "direction": [0.0, 0.0, 1.0]}}, "a wind blows along the sea"),
+        ({"surface": {**BAY["surface"], "direction": [0.0, 0.0, 1.0]}}, "wind and waves go along the sea"),
         ({"surface": {**BAY["surface"], "waves": {"size": 5.0}}}, "5.0 m holds no wave of the peak, 8.23 m long"),
         ({"surface": {**BAY["surface"], "waves": {"shortest": 0.01}}}, "shortest = 0.01 m is less than two nodes"),
-        ({"surface": {**BAY["surface"], "waves": {"heights": "a.npy", "seed": 2}}}, "seed is of a spectrum"),
+        (
+            {"surface": {**BAY["surface"], "waves": {"heights": "a.npy", "seed": 2}}},
+            "seed = 2 goes with a spectrum, in",
+        ),
         ({"surface": {**BAY["surface"], "wind": None, "mean_square_slope": 0.02, "waves": {}}}, "spectrum needs wind"),
     ],
 )

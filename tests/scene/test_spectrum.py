@@ -78,7 +78,7 @@ def test_lines_in_the_water():
     scene = plane(medium={"chlorophyll": 0.5}, laser__linewidth_nm=20.0)
     lines = spectral_lines(scene.laser, scene.detector)
     optics = [spadwarp.water.water_optics(line.wavelength_nm, chlorophyll=0.5) for line in lines]
-    assert [x.extinction for x in water_lines(scene)] == pytest.approx([x.extinction for x in optics])
+    assert [water.extinction for _, water in water_lines(scene)] == pytest.approx([x.extinction for x in optics])
     assert len(lines) == 32
     assert len(water_lines(plane(laser__linewidth_nm=20.0))) == 1  # coefficients given as numbers hold for all
 

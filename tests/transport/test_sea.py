@@ -11,7 +11,7 @@ from helpers.scenes import scene
 from helpers.statistics_of_samples import equal_means_p
 from spadwarp.device import pick_device
 from spadwarp.mesh import build_mesh
-from spadwarp.scene.scan import shot_scene
+from spadwarp.scene import shot_scene
 from spadwarp.scene.sight import depth_from_time, lines_of_sight
 from spadwarp.transport.model import build_model
 
