@@ -25,12 +25,13 @@ from spadwarp.frames import Frames, detect, detector_response, first_photon_prob
 from spadwarp.frames.depth import METHODS, Method, arrival_time
 from spadwarp.frames.response import FWHM_PER_SIGMA
 from spadwarp.result import Channel, Result, analyser_channel, merge
+from spadwarp.result.analysis import off_edges
 from spadwarp.scene import Scene, noise_rate
 from spadwarp.scene.camera import pixel_directions
 from spadwarp.scene.sight import depth_from_time, depth_per_time
 from spadwarp.transport import Progress, RunOptions, simulate, truth_maps
 from spadwarp.transport.reconstruction import known_light
-from spadwarp.values import ConfigError, SpadwarpWarning
+from spadwarp.values import ConfigError, SpadwarpWarning, range_from_time
 
 __all__ = ["Pilot"]
 
@@ -54,6 +55,7 @@ class Pilot:
     pixels that each have a few heavy photons is too low."""
 
     pixels: int  # with a target
+    surfaces: tuple[float, ...]  # depths in the window, of a twentieth of these pixels each, that edges separate [m]
     unscattered: float  # detections of the target per pulse in the gate, without scattered light
     target: float  # the same with it
     backscatter: float  # of backscatter, and of light that met the surface of a sea alone
@@ -100,8 +102,8 @@ def window(scene: Scene, device: str | None = None) -> Scene:
 
 
 def typical_pixels(scene: Scene, device: str | None = None) -> Mask:
-    """The third of the pixels with a target whose unscattered light is nearest to the median: what is known of it
-    without a photon does not choose pixels by their noise. bool `[H, W]`."""
+    """The third of the pixels with a target, off its edges, whose unscattered light is nearest to the median: what is
+    known of it without a photon does not choose pixels by their noise. bool `[H, W]`."""
     truth = truth_maps(scene, device=device)
     if scene.surface is None:
         light = known_light(scene, None, pick_device(device)).direct.numpy().sum(axis=-1, dtype=np.float64)
@@ -111,9 +113,9 @@ def typical_pixels(scene: Scene, device: str | None = None) -> Mask:
         surface: Any = {"distance": truth.range.ravel(), "normal": normal, "reflectance": truth.reflectance.ravel()}
         maps, _ = pixel_maps(scene, view=view, **surface, device=device, outliers=False)
         light = maps["signal"].reshape(truth.depth.shape)
-    light[np.isnan(truth.depth)] = np.nan
-    off = np.abs(light - np.nanmedian(light))
-    chosen = np.argsort(off, axis=None, kind="stable")[: max(1, np.isfinite(light).sum() // 3)]
+    hit = np.isfinite(truth.depth)
+    off = np.where(off_edges(truth.depth)[0], np.abs(light - np.median(light[hit])), np.nan)
+    chosen = np.argsort(off, axis=None, kind="stable")[: max(1, hit.sum() // 3)]
     return np.isin(np.arange(light.size), chosen).reshape(light.shape)
 
 
@@ -210,6 +212,7 @@ def measure(
     lights = [run.tallies[:2].sum(axis=(0, 3), dtype=np.float64)[seen] for run in (first, second)]
     return Pilot(
         pixels=int(seen.sum()),
+        surfaces=_surfaces(both),
         unscattered=float(both.component("ballistic")[typical].sum(axis=-1).mean() * scale),
         target=float(returned.sum()),
         backscatter=float(_background(both)[typical].sum(axis=-1).mean() * scale),
@@ -263,6 +266,15 @@ def _brightest(first: Floats, second: Floats) -> float:
     pairs = ((first, second), (second, first))
     top = [mine.ravel()[np.argsort(uniform_filter(other, 3), axis=None)[-count:]] for mine, other in pairs]
     return float(np.mean(top)) or float((first + second).max()) / 2.0
+
+
+def _surfaces(result: Result) -> tuple[float, ...]:
+    """See `Pilot`: depths lie farther apart than the returns of two can be told, and than those of a slope do."""
+    depth = np.sort(result.truth.depth[np.isfinite(result.truth.depth)])
+    resolved = range_from_time(FWHM_PER_SIGMA * response_deviation(result.scene), result.scene.medium.group_index)
+    apart = max(resolved, 3.0 * off_edges(result.truth.depth)[1])
+    parts = np.split(depth, np.flatnonzero(np.diff(depth) > apart) + 1)
+    return tuple(float(np.median(part)) for part in parts if 20 * len(part) >= len(depth))
 
 
 def response_deviation(scene: Scene) -> float:

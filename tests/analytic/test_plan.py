@@ -109,6 +109,19 @@ def test_counts_and_floor_are_those_of_the_whole_simulation(found):
     assert floor > 3 * found.pilot.unscattered_floor["likelihood"]
 
 
+def test_typical_pixels_are_off_edges_and_the_verdict_names_the_surfaces(found):
+    """Of a staircase with an edge on the axis; a plate that is turned has one surface."""
+    scene = spadwarp.load_scene("staircase_5m").with_overrides({"targets[0].translation": [0.0, 0.0, 6.0]})
+    edges = proposal(scene, photons=100_000, depth_error=0.02)
+    assert edges.judged and edges.pilot.surfaces == pytest.approx((5.6, 5.7, 5.9, 6.0), abs=0.01)
+    assert "between depths of 5.6, 5.7, 5.9, 6 m" in _verdict(edges)
+    window = planning.window(scene)
+    depth = spadwarp.truth_maps(window, device="cpu").depth
+    for row, column in np.argwhere(planning.typical_pixels(window, "cpu")):
+        assert np.ptp(depth[max(row - 1, 0) : row + 2, max(column - 1, 0) : column + 2]) < 1e-3
+    assert len(found.pilot.surfaces) == 1 and "Edges" not in _verdict(found)
+
+
 @pytest.mark.slow
 @pytest.mark.physics
 def test_clear_water_leaves_no_floor_and_its_bound_is_that_of_a_gaussian():
@@ -346,32 +359,19 @@ def test_a_range_that_is_not_judged_counts_neither_as_reached_nor_as_not(start, 
 
 @pytest.mark.slow
 def test_the_page_shows_verdicts_as_they_are_printed():
-    page = (ROOT / "docs" / "planning.md").read_text(encoding="utf-8")
+    page = " ".join((ROOT / "docs" / "planning.md").read_text(encoding="utf-8").split())
     found, terms = plan(20_000), dict.fromkeys(("shot noise", "total"), 0.0)
-    reached = {"reached": True, "pulses_for": "depth error", "pulses_range": (260, 500), "terms": terms}
-    said = [
-        {"pulses": 340, "frame_time": 17.2e-6, "limit": "forward scattering", "terms": terms | {"total": 0.00998}},
-        {
-            "pulses": 18_000,
-            "pulses_range": (15_000, 22_000),
-            "frame_time": 1.8,
-            "limit": "backscatter",
-            "reached": False,
-        },
-        {
-            "pulses": 900,
-            "pulses_range": (890, 910),
-            "pulses_for": "floor",
-            "frame_time": 45e-6,
-            "limit": "bin width",
-            "reached": False,
-        }
-        | {"terms": terms | {"total": 0.161}},
-        {"pulses_for": "not judged", "pilot": dataclasses.replace(found.pilot, photons=3_200_000)}
-        | {"photons_needed": 5.1e7, "seconds_needed": 340.0},
-    ]
-    for changes in said:
-        assert f"- `{_verdict(dataclasses.replace(found, **(reached | changes)))}`" in page
+    edges = dataclasses.replace(found.pilot, surfaces=(4.6, 4.7, 4.9, 5.0))
+    few = dataclasses.replace(found.pilot, photons=3_200_000)
+    found = dataclasses.replace(found, reached=True, pulses_for="depth error", terms=terms, limit="forward scattering")
+    first = {"pulses": 310, "pulses_range": (250, 410), "frame_time": 15.7e-6, "terms": terms | {"total": 0.00998}}
+    long = {"pulses": 18_000, "pulses_range": (15_000, 22_000), "frame_time": 1.8, "limit": "backscatter"}
+    out = {"pulses": 900, "pulses_range": (890, 910), "frame_time": 45e-6, "limit": "bin width", "pulses_for": "floor"}
+    out |= {"terms": terms | {"total": 0.161}}
+    unjudged = {"pulses_for": "not judged", "pilot": few, "photons_needed": 5.1e7, "seconds_needed": 340.0}
+    for changes in (first, long | {"reached": False}, out | {"reached": False}, unjudged):
+        assert f"- `{_verdict(dataclasses.replace(found, **changes))}`" in page
+    assert f"`{_verdict(dataclasses.replace(found, pilot=edges, **first)).partition('. ')[2]}`" in page
 
 
 def test_hopeless_water_is_named_before_a_photon_is_traced(monkeypatch):
