@@ -40,6 +40,7 @@ Mask = NDArray[np.bool_]
 _SIDE = 16  # largest width and height of the window [pixels]
 _MOST_NOISE = 0.95  # part of the information that may be noise; a bound from what is left of more would be noise itself
 _MOST_DRAWN, _OCTAVES = 1 << 19, 8  # counts that are drawn at a time, for 1 to 4^7 times the pulses
+_OFFSETS = 8  # of the bins against the target: nobody knows where in a bin it lies
 _MEAN_OF_90 = 0.657  # mean of the smallest 90 % of the moduli of normal errors, over their standard deviation
 RUNS = 8  # of a quarter of the photons each two, whose scatter tells the noise of all
 
@@ -184,22 +185,28 @@ def measure(
             source=scene.source,
         )
 
-    def median(values: Any) -> float:
-        values = np.asarray(values)[seen]
-        finite = values[np.isfinite(values)]
-        return float(np.median(finite)) if finite.size else math.inf
+    def median(values: Floats, axis: int | None = None) -> Any:
+        finite = values[np.isfinite(values).all(axis=-1)]
+        return np.median(finite, axis) if len(finite) else math.inf
 
     def errors(frames: Frames, histogram: Any) -> dict[str, Any]:
-        """Depth by each estimator, from a histogram without noise, less the true depth [m]."""
+        """Depth by each estimator, from a histogram without noise, less the true depth [m], at offsets of the bins
+        (last axis): the time within a bin is lost, so that the error moves with the target's place in it."""
         times = {method: _time(frames, histogram, frames.background, method, device) for method in METHODS}
-        return {name: depth_from_time(time, scene=both.scene) - both.truth.depth for name, time in times.items()}
+        depths = {name: depth_from_time(time, scene=both.scene) for name, time in times.items()}
+        return {name: ((depth - both.truth.depth)[..., None] + moved)[seen] for name, depth in depths.items()}
 
+    width = scene.gate.bin_width
+    places = (both.true_path() / both.scene.medium.pulse_speed - scene.gate.start)[..., None] / width % 1.0
+    depth_per_bin = depth_per_time(both.scene, np.nan_to_num(both.truth.range.astype(np.float64)))[..., None] * width
+    moved = (places - (np.arange(_OFFSETS) + 0.5) / _OFFSETS) * depth_per_bin
     error, unscattered = errors(frames, light), errors(clear_frames, clear_frames.expected.astype(np.float64))
-    bias = {method: median(values) for method, values in error.items()}
+    bias = {method: float(median(values)) for method, values in error.items()}
+    moduli = {method: np.abs(median(values, 0) if even else values) for method, values in error.items()}
     piled: dict[str, float] = {method: 0.0 for method in METHODS}
     if scene.detector.mode == "first_photon":
         recorded = errors(frames, first_photon_probabilities(light, device=device))
-        piled = {method: median(recorded[method] - error[method]) for method in METHODS}
+        piled = {method: float(median(recorded[method] - error[method])) for method in METHODS}
     scale = both.scene.laser.photons_per_pulse * scene.detections_per_photon
     pool = _Pool(both, typical)
     returned, constant = pool(signal), pool(background)
@@ -221,9 +228,9 @@ def measure(
         bound=bound,
         shot_noise=shot,
         information_noise=information_noise,
-        floor={name: abs(bias[name]) if even else median(np.abs(values)) for name, values in error.items()},
+        floor={name: float(np.median(values) if even else median(values)) for name, values in moduli.items()},
         bias=bias,
-        unscattered_floor={name: median(np.abs(values)) for name, values in unscattered.items()},
+        unscattered_floor={name: float(median(np.abs(values))) for name, values in unscattered.items()},
         pile_up=piled,
         peak=float(peak),
         level=float(level),
