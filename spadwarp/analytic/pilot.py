@@ -39,7 +39,7 @@ Mask = NDArray[np.bool_]
 
 _SIDE = 16  # largest width and height of the window [pixels]
 _MOST_NOISE = 0.95  # part of the information that may be noise; a bound from what is left of more would be noise itself
-_MOST_DRAWN, _OCTAVES = 1 << 19, 8  # counts that are drawn at a time, for 1 to 4^7 times the pulses
+_MOST_DRAWN, _OCTAVES = 1 << 20, 8  # counts that are drawn at a time, for 1 to 4^7 times the pulses
 _OFFSETS = 8  # of the bins against the target: nobody knows where in a bin it lies
 _MEAN_OF_90 = 0.657  # mean of the smallest 90 % of the moduli of normal errors, over their standard deviation
 RUNS = 8  # of a quarter of the photons each two, whose scatter tells the noise of all
@@ -251,7 +251,7 @@ def _excess(
 ) -> tuple[tuple[float, float], ...]:
     """See `Pilot`: arrival times of counts that are drawn from `light` [T] against that of `light` itself; `bound` for
     one pulse [s]. The largest tenth of the errors, false peaks, are left out."""
-    drawn, random, found = int(np.clip(_MOST_DRAWN // len(light), 16, 512)), np.random.default_rng(0), []
+    drawn, random, found = int(np.clip(_MOST_DRAWN // len(light), 16, 4096)), np.random.default_rng(0), []
     if frames.detector.mode == "first_photon":
         light = first_photon_probabilities(light[None, None], device=device)[0, 0]
     for pulses in first * 4.0 ** np.arange(_OCTAVES):

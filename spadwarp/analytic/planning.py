@@ -288,6 +288,10 @@ class _Sample(NamedTuple):
         for name in ("bound", "shot_noise", "peak"):
             best[name], worst[name] = ends([getattr(one, name) for one in every], ratio=True)
         worst["peak"], best["peak"] = best["peak"], worst["peak"]
+        noise = [ends([float(_noise(one, n)) * math.sqrt(n) for one in every], ratio=True) for n, _ in centre.excess]
+        for i, side in enumerate((best, worst)):
+            ratios = [max(pair[i] / side["bound"], 1.0) for pair in noise]
+            side["excess"] = tuple((n, ratio) for (n, _), ratio in zip(centre.excess, ratios, strict=True))
         best["level"], worst["level"] = ends([one.level for one in every], ratio=False)
         for name in ("floor", "pile_up"):
             pairs = {key: ends([abs(getattr(one, name)[key]) for one in every], ratio=False) for key in METHODS}
@@ -396,7 +400,7 @@ class _Planner:
     ) -> tuple[Scene, str, float, Pilot]:
         """The scene with its pulse energy, what sets it, that of pile-up; and what an even number of runs measured."""
         options: dict[str, Any] = {"even": even, "channel": self.channel, "depth_error": self.depth_error}
-        options["method"] = self.method if len(runs) == RUNS else "likelihood"  # parts have the noise of all
+        options["method"] = self.method
         found = measure(runs, scene, typical, self.device, **options)
         piled = scene.laser.pulse_energy * max(PILE_UP - found.noise, 0.0) / found.brightest
         allowed = {"pile-up": piled} | ({} if self.eye_distance is None else {"eye": self._eye(scene).pulse_energy})
