@@ -118,7 +118,7 @@ sweep SCENE --medium uwoc-cleer | uwoc-clear
 depth DONE --out OUT --input bin_width=5ps | the file has its own bin_width
 depth SCENE --out OUT --input bin_with=5ps | 'bin_with' is not one of bin_width, gate_start, irf
 depth SCENE --out OUT --input image_size=5 | image_size = '5' is not of the form WIDTHxHEIGHT
-denoise SCENE --out OUT --gate 90ns:110ns | group_index
+denoise SCENE --out OUT --gate 110ns:90ns | --gate | 110ns is more than 90ns
 fit SCENE --bounds --unknown absorption --prior reflectance=0.5,0.1 --photons 1000 | targets[0].reflectance is not
 fit SCENE --unknown depth --prior medium.anisotropy=0.9 | is not NAME=MEAN,SD
 """
