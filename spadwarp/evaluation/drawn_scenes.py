@@ -19,13 +19,12 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from spadwarp.denoise.baselines import FROM_COUNTS, MEDIAN_WINDOWS, METHODS
+from spadwarp.denoise.baselines import MEDIAN_WINDOWS, compared
 from spadwarp.denoise.frames import DepthFrames, depth_frames
 from spadwarp.denoise.inference import Estimate, estimate_frames, target_threshold
-from spadwarp.denoise.network_files import compared
 from spadwarp.denoise.recipe import LEVELS
 from spadwarp.evaluation.datasets import Steps, near_jumps, staircase_steps
-from spadwarp.values import ArgumentError, check_choice
+from spadwarp.values import ArgumentError
 
 __all__ = ["SceneScores", "evaluate_scenes"]
 
@@ -302,11 +301,9 @@ def evaluate_scenes(
         seed: Of the noise.
         weights, device, progress: See `evaluate`, as for errors.
     """
-    for name in models:
-        check_choice("models", name, [one for one in METHODS if one not in FROM_COUNTS])
     if scenes is None:
         scenes = [evaluation_scene(shape, setting) for setting in SETTINGS for shape in SHAPES]
-    chosen, methods = list(scenes), compared(["input", *models], weights)
+    chosen, methods = list(scenes), compared(models, weights)
     rows: dict[tuple[str, str, str, float, str], FrameScores] = {}
     best: dict[tuple[str, str, float], int] = {}
     reliability: dict[tuple[str, str], NDArray[np.int64]] = {}
