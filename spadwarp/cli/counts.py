@@ -84,14 +84,12 @@ def detect(
     files = [recording.file.path, spadwarp.viz.draw(recording.file, out / "frame.png", pixel=pixel)]
     found = _recorded(recording, frames)
     each, limit = found["detections_per_pulse_and_pixel"], spadwarp.analytic.PILE_UP
-    if (
-        each > limit
-        and scene.detector.mode == "first_photon"
-        and not coates
-        and recording.file.target_noise_ratio != math.inf
-    ):
+    light = float(result.detections.sum(axis=2).mean())
+    lost = light > 0.0 and recording.file.target_noise_ratio == math.inf  # all of it, which is said already
+    if each > limit and scene.detector.mode == "first_photon" and not (coates or lost):
         text = f"pile-up: {each:.2g} detections per pulse and pixel, more than {limit:g}, shift depth towards the laser"
-        complain(f"{text}; less laser.pulse_energy, or --coates", "warning")
+        less = "laser.pulse_energy" if light > 0.5 * each else "dark counts and ambient light"
+        complain(f"{text}; less {less}, or --coates", "warning")
     answer({**found, "channel": channel, "files": files})
 
 
