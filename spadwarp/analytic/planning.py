@@ -234,6 +234,9 @@ def plan(
         scene = with_plane(scene, span[1])
     if problem:
         raise ConfigError(problem, source=scene.source)
+    if planner.depth_error > span[0]:
+        wanted, nearest = f"{planner.depth_error:g} m", f"{span[0]:.3g} m"
+        raise ArgumentError(f"depth_error = {wanted} is more than the range of the target, {nearest}; numbers are in m")
     proposal = planner.propose(with_gate(scene, span, planner.margin), span, number)
     if eye_distance is not None and not isinstance(scene.medium.albedo, str):
         water = safe_distance_in_water(proposal.scene, exposure=planner.eye_exposure, seed=seed, device=device)

@@ -71,7 +71,7 @@ _Range = Annotated[tuple[float, float], opt.from_to("m")]
 def plan(
     scene: Path,
     *,
-    depth_error: opt.Length = 0.01,
+    depth_error: opt.DepthError = 0.01,
     time: opt.Seconds = 1.0,
     range_: _Range | None = None,
     margin: opt.Length = 0.25,
@@ -216,7 +216,7 @@ def sweep(
     medium: list[str] | None = None,
     reflectance: float | None = None,
     of: Literal["budget", "plan"] | None = None,
-    depth_error: opt.Length = 0.01,
+    depth_error: opt.DepthError = 0.01,
     time: opt.Seconds = 1.0,
     method: opt.Method = "likelihood",
     photons: int | None = None,

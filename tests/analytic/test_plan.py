@@ -225,6 +225,7 @@ def test_ranges_stand_for_an_unknown_target():
         ({"depth_error": "2 ns"}, "depth_error = '2 ns' is a time; a length is needed"),
         ({"ranges": ("3 m", "2 m")}, "least <= largest"),
         ({"depth_error": 0.0}, "depth_error = 0.0"),
+        ({"depth_error": 10}, "depth_error = 10 m is more than the range of the target, 5.93 m; numbers are in m"),
         ({"ranges": 5.0}, "ranges = 5.0 is not of the type tuple"),
         ({"method": "guess"}, "'guess' is not one of"),
         ({"margin": -1.0}, "margin = -1.0"),

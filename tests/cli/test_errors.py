@@ -105,6 +105,7 @@ plan SCENE --depth-error nan | --depth-error
 plan SCENE --range nan:5 | range
 plan SCENE --range 1:10m | '1:10m' is ambiguous: 10m has a unit and 1 has none
 plan SCENE --range 10ns:60ns | is a time; a length is needed
+plan SCENE --depth-error 10 | --depth-error | 10 without a unit is in m; write the unit, such as 10mm or 10m
 plan SCENE --range 3 | FROM:TO
 plan SCENE --range 9m:8m | 9m is more than 8m
 sweep SCENE --vary range=1:10cm:5 | is ambiguous
