@@ -106,7 +106,7 @@ class Optimiser(Section):
     redraw: Whole = Field(200, ge=1, le=10**12, description="updates between two drawings of scenes")
     learning_rate: float = Field(1e-3, ge=1e-12, le=1e3, description="highest; falls along a cosine to a hundredth")
     warm_up: Whole = Field(500, ge=0, le=10**12, description="updates in which the learning rate rises")
-    weight_decay: float = Field(1e-4, ge=0, le=1e3, description="that of the optimiser AdamW")
+    weight_decay: float = Field(0.1, ge=0, le=1e3, description="that of the optimisers, Muon and AdamW")
     averaging: float = Field(0.999, ge=0, lt=1, description="decay of the running mean of the weights, which is saved")
     report_every: Whole | None = Field(
         None, ge=1, le=10**12, description="updates between two lines of the log; default: steps / 20, at most 500"

@@ -76,8 +76,8 @@ class Random:
 def procedural_scenes(count: int, side: int, *, seed: int, device: torch.device | str, finer: int = 1) -> CleanScenes:
     """Scenes in water of flat backscatter, with gates around them.
 
-    With `finer` they are of so many rows and columns of subpixels in each pixel, in part from farther away, and steep
-    surfaces are darker.
+    With `finer` they are of so many rows and columns of subpixels in each pixel, in part from farther away, steep
+    surfaces are darker, and some scenes are evenly bright but for that.
     """
     generator = torch.Generator(device).manual_seed(seed)
     random = Random(count, generator)
@@ -108,7 +108,10 @@ def procedural_scenes(count: int, side: int, *, seed: int, device: torch.device 
     metres = 15.0 + relief * (depth - 0.5)
     grain = 0.5 * random.uniform(1, 1) * random.coin(0.3, 1, 1) * random.normal(*depth.shape[1:])  # from pixel to pixel
     texture = 0.5 * smooth_noise(random, side * finer) + 0.3 * _pattern(side, random, finer)
-    texture = torch.exp(texture + paint + grain)
+    texture += paint + grain
+    if finer > 1:
+        texture *= 1.0 - random.uniform(1, 1) * random.coin(0.4, 1, 1)
+    texture = texture.exp()
     if finer > 1:
         texture *= _steepness(metres * finer / random.log_between((0.01, 0.12), 1, 1)).square().add(1.0) ** 0.25
     sigma = torch.where(torch.isfinite(metres), _JITTER * texture.clamp(0.3, 4.0), math.nan)

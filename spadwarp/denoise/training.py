@@ -183,6 +183,43 @@ def _mean_with_target(error: Tensor, hit: Tensor) -> Tensor:
 
 # Steps
 
+_MOMENTUM = 0.95  # of Muon
+_MATRIX = 8  # rows and columns at least of its matrices
+
+
+class Muon(torch.optim.Optimizer):
+    """Momentum of matrices, orthogonalised: all its singular values become about 1. Filters are matrices of outputs.
+
+    Jordan et al., Muon: an optimizer for hidden layers in neural networks (2024). A step is as large as those of AdamW:
+    Liu et al., arXiv:2502.16982 (2025).
+    """
+
+    @torch.no_grad()
+    def step(self, closure: None = None) -> None:  # type: ignore[override]
+        (group,) = self.param_groups
+        by_shape: dict[torch.Size, list[tuple[Tensor, Tensor]]] = {}
+        for parameter in group["params"]:
+            if not (state := self.state[parameter]):
+                state["momentum"] = torch.zeros_like(parameter)
+            momentum = state["momentum"].lerp_(parameter.grad, 1.0 - _MOMENTUM)
+            pair = parameter, torch.lerp(parameter.grad, momentum, _MOMENTUM).flatten(1)  # Nesterov's
+            by_shape.setdefault(pair[1].shape, []).append(pair)
+        for (rows, columns), pairs in by_shape.items():
+            turned = torch.stack([matrix.T if rows > columns else matrix for _, matrix in pairs])
+            turned /= turned.norm(dim=(1, 2), keepdim=True) + 1e-7
+            for _ in range(5):  # Newton and Schulz: singular values s to 3.4445 s − 4.775 s³ + 2.0315 s⁵
+                square = turned @ turned.mT
+                factor = torch.baddbmm(square, square, square, beta=-4.775, alpha=2.0315)
+                turned = torch.baddbmm(turned, factor, turned, beta=3.4445)
+            turned = (turned.mT if rows > columns else turned) * (group["lr"] * 0.2 * max(rows, columns) ** 0.5)
+            for (parameter, _), change in zip(pairs, turned, strict=True):
+                parameter.mul_(1.0 - group["lr"] * group["weight_decay"]).sub_(change.view_as(parameter))
+
+
+def _is_matrix(parameter: Tensor) -> bool:
+    """Whether `Muon` steps it; the last layers have few outputs."""
+    return parameter.dim() > 1 and min(parameter.flatten(1).shape) >= _MATRIX
+
 
 @dataclass(frozen=True, kw_only=True)
 class Trained:
@@ -255,13 +292,16 @@ class Run:
             self.network = self.network.to(memory_format=torch.channels_last)
         self.average = copy.deepcopy(self.network).requires_grad_(False)
         rate, decay = recipe.optimiser.learning_rate, recipe.optimiser.weight_decay
-        self.optimiser = torch.optim.AdamW(
-            self.network.parameters(), lr=torch.tensor(rate, device=device) if is_cuda else rate,
-            weight_decay=decay, betas=(0.9, 0.99), fused=is_cuda, capturable=is_cuda,
-        )  # fmt: skip
+        common: dict[str, Any] = {"lr": torch.tensor(rate, device=device) if is_cuda else rate, "weight_decay": decay}
+        matrices, others = ([p for p in network.parameters() if _is_matrix(p) == one] for one in (True, False))
+        self.optimisers = (
+            Muon(matrices, common),
+            torch.optim.AdamW(others, betas=(0.9, 0.99), fused=is_cuda, capturable=is_cuda, **common),
+        )
         self.generator = torch.Generator(device).manual_seed(recipe.seed * 1009)
         self.samples = Samples(recipe, self.generator, given)
-        self.state = {"network": self.network, "average": self.average, "optimiser": self.optimiser}
+        self.state = {"network": self.network, "average": self.average}
+        self.state |= dict(zip(("matrices", "others"), self.optimisers, strict=True))
         self.loss_sum = torch.zeros((), device=device)  # of the steps since the last report
         self.step, spent = self._resume()
         self.graphs: dict[Any, tuple[Any, Tensor] | None] = {}  # recorded steps and losses, of samples of a kind
@@ -323,8 +363,8 @@ class Run:
     def update(self) -> None:
         """One step, whose samples are prepared. On a GPU steps are replayed as a CUDA graph: launched faster."""
         rate = _learning_rate(self.step, self.recipe)
-        (group,) = self.optimiser.param_groups
-        group["lr"] = group["lr"].fill_(rate) if isinstance(group["lr"], Tensor) else rate
+        for group in (group for one in self.optimisers for group in one.param_groups):
+            group["lr"] = group["lr"].fill_(rate) if isinstance(group["lr"], Tensor) else rate
         kind = self.samples.kind
         if recorded := self.graphs.get(kind):
             graph, loss = recorded
@@ -352,7 +392,7 @@ class Run:
         self.graphs[kind] = None
         try:
             graph.register_generator_state(self.generator)
-            self.optimiser.zero_grad(set_to_none=True)
+            self.network.zero_grad(set_to_none=True)
             with torch.cuda.graph(graph, pool=self.pool):
                 loss = self._work()
             self.pool = graph.pool()
@@ -368,10 +408,11 @@ class Run:
         with torch.autocast(self.device.type, dtype=torch.bfloat16, enabled=is_cuda, cache_enabled=False):
             output = self.network(*batch.inputs)
         loss = histogram_loss(output[0], output[1], batch) if self.counting else loss_of(output.float(), batch)
-        self.optimiser.zero_grad(set_to_none=True)
+        self.network.zero_grad(set_to_none=True)
         loss.backward()
         nn.utils.clip_grad_norm_(self.network.parameters(), 1.0)
-        self.optimiser.step()
+        for optimiser in self.optimisers:
+            optimiser.step()
         return loss.detach()
 
     def save_checkpoint(self) -> None:
