@@ -196,10 +196,9 @@ def measure(
         depths = {name: depth_from_time(time, scene=both.scene) for name, time in times.items()}
         return {name: ((depth - both.truth.depth)[..., None] + moved)[seen] for name, depth in depths.items()}
 
-    width = scene.gate.bin_width
-    places = (both.true_path() / both.scene.medium.pulse_speed - scene.gate.start)[..., None] / width % 1.0
-    depth_per_bin = depth_per_time(both.scene, np.nan_to_num(both.truth.range.astype(np.float64)))[..., None] * width
-    moved = (places - (np.arange(_OFFSETS) + 0.5) / _OFFSETS) * depth_per_bin
+    pool, offsets = _Pool(both, typical), (np.arange(_OFFSETS) + 0.5) / _OFFSETS
+    places = (both.true_path() / both.scene.medium.pulse_speed - scene.gate.start) / scene.gate.bin_width % 1.0
+    moved = (places[..., None] - offsets) * pool.slope * scene.gate.bin_width
     error, unscattered = errors(frames, light), errors(clear_frames, clear_frames.expected.astype(np.float64))
     bias = {method: float(median(values)) for method, values in error.items()}
     moduli = {method: np.abs(median(values, 0) if even else values) for method, values in error.items()}
@@ -208,7 +207,6 @@ def measure(
         recorded = errors(frames, first_photon_probabilities(light, device=device))
         piled = {method: float(median(recorded[method] - error[method])) for method in METHODS}
     scale = both.scene.laser.photons_per_pulse * scene.detections_per_photon
-    pool = _Pool(both, typical)
     returned, constant = pool(signal), pool(background)
     peak, level = _return(returned, constant, both.scene)
     bound, shot, information_noise = _bounds(both, (first, second), pool, device)

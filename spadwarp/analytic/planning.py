@@ -235,8 +235,8 @@ def plan(
     if problem:
         raise ConfigError(problem, source=scene.source)
     if planner.depth_error > span[0]:
-        wanted, nearest = f"{planner.depth_error:g} m", f"{span[0]:.3g} m"
-        raise ArgumentError(f"depth_error = {wanted} is more than the range of the target, {nearest}; numbers are in m")
+        nearest = f"the range of the target, {span[0]:.3g} m; numbers are in m"
+        raise ArgumentError(f"depth_error = {planner.depth_error:g} m is more than {nearest}")
     proposal = planner.propose(with_gate(scene, span, planner.margin), span, number)
     if eye_distance is not None and not isinstance(scene.medium.albedo, str):
         water = safe_distance_in_water(proposal.scene, exposure=planner.eye_exposure, seed=seed, device=device)
@@ -402,8 +402,7 @@ class _Planner:
         self, scene: Scene, runs: Sequence[Result], typical: Mask, even: bool
     ) -> tuple[Scene, str, float, Pilot]:
         """The scene with its pulse energy, what sets it, that of pile-up; and what an even number of runs measured."""
-        options: dict[str, Any] = {"even": even, "channel": self.channel, "depth_error": self.depth_error}
-        options["method"] = self.method
+        options: Any = {"even": even, "channel": self.channel, "depth_error": self.depth_error, "method": self.method}
         found = measure(runs, scene, typical, self.device, **options)
         piled = scene.laser.pulse_energy * max(PILE_UP - found.noise, 0.0) / found.brightest
         allowed = {"pile-up": piled} | ({} if self.eye_distance is None else {"eye": self._eye(scene).pulse_energy})

@@ -377,13 +377,19 @@ _OF_IMAGES = {"channel": str, "scale": opt.real_number, "as_depth": bool}
 _DenoiseInputs = Annotated[dict[str, Any], opt.items(opt.MEASURED | _SEEN | _OF_IMAGES)]
 
 
+def _gate(text: str) -> tuple[str, tuple[float, float]]:
+    """Name and value of the argument for a gate in depth, or in time of flight."""
+    in_time = "s" in text  # which no unit of length has
+    return ("gate_time", opt.from_to("s")(text)) if in_time else ("gate", opt.from_to("m")(text))
+
+
 @command()
 def denoise(
     path: Path,
     *,
     out: Path,
     model: str = "pyramid",
-    gate: str | None = None,
+    gate: Annotated[tuple[str, tuple[float, float]], _gate] | None = None,
     profile: Path | None = None,
     background: str | None = None,
     weights: Path | None = None,
@@ -440,7 +446,8 @@ def denoise(
     names = [stem + ending for stem in stems for ending in _ENDINGS]
     level, known = _background(background)
     check_outputs(out, names, inputs=(*paths, profile, level, weights, *files), needed=needed)
-    settings: dict[str, Any] = {"model": model, **_gate(gate), "weights": weights, "device": device, "mask": mask}
+    settings: dict[str, Any] = {"model": model, "weights": weights, "device": device, "mask": mask}
+    settings |= dict([] if gate is None else [gate])
     settings |= {"min_significance": min_significance, "background": known, "precision": precision}
     settings["profile"] = None if profile is None else spadwarp.io.read_npy(profile, largest=1 << 20)
     lines: dict[str, str] = {}
@@ -469,12 +476,3 @@ def denoise(
     write_json({"model": model, "files": summary})
     if len(summary) < len(paths):
         raise FileError(f"{path}: {len(paths) - len(summary)} of {len(paths)} files could not be denoised")
-
-
-def _gate(text: str | None) -> dict[str, tuple[float, float]]:
-    """The argument for a gate in depth, or in time of flight."""
-    in_time = "s" in (text or "")  # which no unit of length has
-    try:
-        return {} if text is None else {"gate_time" if in_time else "gate": opt.from_to("s" if in_time else "m")(text)}
-    except typer.BadParameter as error:
-        wrong(error.message, "--gate")

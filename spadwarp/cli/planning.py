@@ -201,8 +201,7 @@ def _terms(found: Proposal) -> dict[str, str]:
         "forward scattering": f"{found.method}; does not fall with the pulses; {floors}; from {count(pilot.photons)} "
         f"traced photons; {unscattered}",
         "pile-up": "change of the median depth",
-        "total": "root of the sum of squares, near the axis; the median error that `spadwarp detect` reports is of the "
-        "whole frame and may be less or more",
+        "total": "root of the sum of squares, near the axis; `spadwarp detect` reports the median of the whole frame",
     }
     title = f"depth error, {count(found.pulses)} pulses"
     return {title: "mm"} | {name: f"{short(1000 * value):<6}  {about[name]}" for name, value in found.terms.items()}

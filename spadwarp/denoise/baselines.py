@@ -21,11 +21,6 @@ MEDIAN_WINDOWS = (3, 5, 7, 9, 11)
 """Sides of the median's window that are tried [pixels]."""
 
 
-def unfiltered(frames: DepthFrames) -> Frames:
-    """The frames as they are, `[N, H, W]` [m]; a pixel without a depth counts as one in the middle of the gate."""
-    return np.nan_to_num(frames.depth, nan=frames.gate_middle)
-
-
 def median_filter(frames: DepthFrames, *, window: int = 5) -> Frames:
     """Median of `window` × `window` pixels, `[N, H, W]` [m]; pixels without a depth take that of their nearest."""
     from scipy import ndimage
@@ -87,7 +82,7 @@ def bm3d_filter(frames: DepthFrames) -> Frames:
 
 
 BASELINES: dict[str, Callable[[DepthFrames], Frames]] = {
-    "input": unfiltered,
+    "input": lambda frames: np.nan_to_num(frames.depth, nan=frames.gate_middle),
     "median": median_filter,
     "gating": gated_filter,
     "bm3d": bm3d_filter,

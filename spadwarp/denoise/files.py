@@ -146,7 +146,11 @@ def read_depth(
         source += f"; {below} values below 0 count as not reported" if below else ""
         gate = _in_depth(gate_time, place, measured.get("group_index"))
         return DepthReading(depth=frames, frames=depth.ndim == 3, gate=gate, profile=None, source=source)
-    histograms = _read_histograms(place, measured | of_result)
+    view = [measured.pop(name, None) for name in ("group_index", "horizontal_fov_deg")]
+    histograms = with_view(read_histograms(place, **measured, **of_result), *view)
+    if histograms.scene is None and histograms.response is None:
+        text = "the instrument response is not given (irf): with it, counts are denoised with their histograms"
+        histograms = dataclasses.replace(histograms, notes=(*histograms.notes, text))
     index = histograms.group_index if histograms.scene is None else histograms.scene.medium.group_index
     gate = gate or _in_depth(gate_time, place, index)
     counted = histograms.values.dtype.kind in "iu" and histograms.response is not None
@@ -167,15 +171,6 @@ def _in_depth(times: tuple[float, float] | None, path: Path, index: float | None
     if times is not None and index is None:
         raise ArgumentError(f"{path}: a gate in time of flight needs a group index (group_index), or give two lengths")
     return times and checked_gate((range_from_time(times[0], index or 1.0), range_from_time(times[1], index or 1.0)))
-
-
-def _read_histograms(path: Path, measured: dict[str, Any]) -> Histograms:
-    view = [measured.pop(name, None) for name in ("group_index", "horizontal_fov_deg")]
-    histograms = with_view(read_histograms(path, **measured), *view)
-    notes = histograms.notes
-    if histograms.scene is None and histograms.response is None:
-        notes += ("the instrument response is not given (irf): with it, counts are denoised with their histograms",)
-    return dataclasses.replace(histograms, notes=notes)
 
 
 def _with_background(held: Histograms, given: ArrayLike | BackgroundLaw | None) -> Histograms:

@@ -257,8 +257,7 @@ def evaluate(
     frames = check_integer("frames", frames, "[1, 1000000000]")
     bm3d_frames = check_integer("bm3d_frames", bm3d_frames, "[0, 1000000000]")
     methods = compared(wanted, None if weights is None else Path(weights))
-    comparison = _Comparison(data, split, frames, crop, methods, device)
-    return comparison.scored(bm3d_frames, progress)
+    return _Comparison(data, split, frames, crop, methods, device).scored(bm3d_frames, progress)
 
 
 class _Comparison:
@@ -321,11 +320,10 @@ class _Comparison:
             return
         count = self.frames[target, level] = self.frames.get((target, level), 0) + 1
         images: dict[str, NDArray[np.float32]] = {}
-        for method in self.methods:
+        for method, named in self.methods.items():
             if method == "bm3d" and count > bm3d_frames:
                 continue
             window = self.windows.get(level, 5)
-            named = self.methods[method]
             found = estimate_frames(noisy, window=window, device=self.device, **named)
             images[method] = found.masked(target_threshold(named["model"]))[0]
             self.scores.setdefault((method, target, level), []).append(score(clean, found.depth[0], gate=noisy.gate))

@@ -189,11 +189,6 @@ def _vase(y: _Image, x: _Image) -> _Image:
     return _nearest((body, 14.8 - np.sqrt(np.maximum(radius**2 - x**2, 0.0))), (handle, 14.8 + 0.0 * x))
 
 
-def _nothing(y: _Image, x: _Image) -> _Image:
-    """No shape at all."""
-    return np.full(y.shape, np.nan)
-
-
 SHAPES: dict[str, Callable[[_Image, _Image], _Image]] = {
     "stairs": _stairs,
     "rings": _rings,
@@ -202,7 +197,7 @@ SHAPES: dict[str, Callable[[_Image, _Image], _Image]] = {
     "spiral": _spiral,
     "lattice": _lattice,
     "vase": _vase,
-    "nothing": _nothing,
+    "nothing": lambda y, x: np.full(y.shape, np.nan),
 }
 """Shapes by name."""
 
@@ -260,10 +255,6 @@ class SceneScores:
     def levels(self) -> list[float]:
         """The backscatter fractions."""
         return sorted({level for _, _, _, level, _ in self.rows})
-
-    def worse_than_input(self, method: str) -> int:
-        """Number of frames whose PSNR is below the input's."""
-        return sum(scores.gain < 0 for (name, *_), scores in self.rows.items() if name == method)
 
     def to_dict(self) -> dict[str, Any]:
         """Numbers and names, for JSON."""

@@ -327,19 +327,14 @@ def test_the_safe_distance_in_water_is_that_of_absorption_alone_where_nothing_sc
 # Verdicts: of few photons none, of hopeless water one before a photon is traced
 
 
-def plan(photons, extinction=0.4, **options):
-    scene = Scene.from_dict(SCENE).with_overrides({"medium.extinction": extinction})
-    return spadwarp.plan(scene, photons=photons, device="cpu", largest_range=False, **options)
-
-
 @pytest.mark.slow
 @pytest.mark.parametrize("depth_error", [0.002, 0.3])
 def test_few_photons_say_that_they_do_not_judge_or_judge_as_many_do(depth_error):
-    many = plan(400_000, depth_error=depth_error, seed=9)
+    many = proposal(depth_error=depth_error, seed=9)
     assert many.judged
     for seed in range(2):
         for photons in (1_000, 30_000):
-            few = plan(photons, depth_error=depth_error, seed=seed)
+            few = proposal(photons=photons, depth_error=depth_error, seed=seed)
             assert not few.judged or few.reached == many.reached
             if not few.judged:
                 assert few.photons_needed > few.pilot.photons and "not enough photons to judge" in repr(few)
@@ -369,7 +364,7 @@ def test_a_range_that_is_not_judged_counts_neither_as_reached_nor_as_not(start, 
 @pytest.mark.slow
 def test_the_page_shows_verdicts_as_they_are_printed():
     page = " ".join((ROOT / "docs" / "planning.md").read_text(encoding="utf-8").split())
-    found, terms = plan(20_000), dict.fromkeys(("shot noise", "total"), 0.0)
+    found, terms = proposal(photons=20_000), dict.fromkeys(("shot noise", "total"), 0.0)
     edges = dataclasses.replace(found.pilot, surfaces=(4.6, 4.7, 4.9, 5.0))
     few = dataclasses.replace(found.pilot, photons=3_200_000)
     found = dataclasses.replace(found, reached=True, pulses_for="depth error", terms=terms, limit="forward scattering")
@@ -386,14 +381,14 @@ def test_the_page_shows_verdicts_as_they_are_printed():
 def test_hopeless_water_is_named_before_a_photon_is_traced(monkeypatch):
     monkeypatch.setattr(planning, "trace", None)
     with pytest.raises(spadwarp.ConfigError, match=r"at 5\.9.* m a pixel detects .* photons at most in all 1e\+05 pul"):
-        plan("auto", extinction=6.0)
+        proposal(make(medium={"extinction": 6.0}), photons="auto")
 
 
 @pytest.mark.slow
 def test_the_bound_before_tracing_is_above_what_is_traced():
     """Light of the target that is traced, of all scatterings, against the bound's 1 in all pulses: it names no water
     in which a pixel detects more."""
-    found = plan(400_000, extinction=1.2)
+    found = proposal(make(medium={"extinction": 1.2}))
     hopeful = found.pilot.target * 1e5
     for time in (1.0 / hopeful, 3.0 / hopeful):
         planning._refuse_hopeless(found.scene, found.target_range[0], time)  # these pulses bring a photon or more
