@@ -5,9 +5,10 @@ from __future__ import annotations
 from typing import Any, Literal, NamedTuple
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
-from spadwarp.arrays import real_array
+import spadwarp_kernels as sk
+from spadwarp.arrays import Floats, as_warp, real_array
 from spadwarp.device import pick_device
 from spadwarp.frames.response import InstrumentResponse, detector_response
 from spadwarp.result.file import ResultLike, as_result
@@ -16,8 +17,6 @@ from spadwarp.scene import noise_rate
 from spadwarp.values import BIN_WIDTH, ArgumentError, check_choice, check_real, percent, shown
 
 __all__ = ["crlb", "crlb_from_histogram", "information_from_histogram"]
-
-Map = NDArray[np.float64]
 
 _PART_VOXELS = 1 << 20
 
@@ -28,7 +27,7 @@ spread exp(1.5), the bound is then 10 to 30 % too large, 40 to 80 % where noise 
 
 def crlb_from_histogram(
     signal_cube: ArrayLike, background_cube: ArrayLike, *, bin_width: float, pulses: float, **options: Any
-) -> Map:
+) -> Floats:
     """Cramér–Rao bound of the delay from the shape of expected histograms, pixel by pixel [s].
 
     F = Σ_k (dλ_k/dμ)²/λ_k with λ = signal + background; the delay μ moves the signal alone. Amplitude and background
@@ -39,7 +38,7 @@ def crlb_from_histogram(
     return _deviation(*information_from_histogram(signal_cube, background_cube, bin_width=bin_width, **options), pulses)
 
 
-def _deviation(information: Map, noise: Map, pulses: float) -> Map:
+def _deviation(information: Floats, noise: Floats, pulses: float) -> Floats:
     with np.errstate(divide="ignore"):
         sigma = 1.0 / np.sqrt(pulses * np.maximum(information - noise, 0.0))
     return np.where(information > 0, sigma, np.nan)
@@ -55,7 +54,7 @@ def information_from_histogram(
     signal_variance: ArrayLike | None = None,
     signal_halves: tuple[ArrayLike, ArrayLike] | None = None,
     device: Any = None,
-) -> tuple[Map, Map]:
+) -> tuple[Floats, Floats]:
     """Fisher information on the delay per pulse, and its part that is noise of a Monte Carlo estimate: float64 `[...]`
     [1/s²]. The noise is one for all pixels together: in one it may be larger than the information, or negative.
 
@@ -76,10 +75,6 @@ def information_from_histogram(
 
     Raises `ArgumentError`: negative or non-finite cubes, shapes that do not fit, values out of range.
     """
-    import warp as wp
-
-    from spadwarp_kernels import analytic as kernels
-
     signal = np.ascontiguousarray(real_array("signal_cube", signal_cube, within="[0, inf)"))
     if signal.size == 0:
         raise ArgumentError(f"signal_cube has shape {signal.shape}: no values")
@@ -99,9 +94,9 @@ def information_from_histogram(
         taps, slope_taps = irf.per_bin(bin_width), irf.per_bin_slope(bin_width)
     device = pick_device(device)
     rows = np.ascontiguousarray(background.reshape(-1, bins) if background.ndim else background.reshape(1, 1))
-    inputs: list[Any] = [wp.array(cube, dtype=wp.float32, device=device) for cube in (signal.reshape(-1, bins), rows)]
-    inputs += [wp.array(weights, dtype=wp.float64, device=device) for weights in (taps, slope_taps)]
-    information = kernels.histogram_information(*inputs, first_photon=law == "first_photon").numpy()
+    given = {"signal": signal.reshape(-1, bins), "background": rows, "taps": taps, "slope_taps": slope_taps}
+    inputs = [as_warp(array, name=name, device=device) for name, array in given.items()]
+    information = sk.analytic.histogram_information(*inputs, first_photon=law == "first_photon").numpy()
     noise = np.zeros_like(information)
     total = np.asarray(signal + background, np.float64).reshape(-1, bins)
     if signal_halves is not None:
@@ -116,8 +111,8 @@ def information_from_histogram(
 
 
 def _information_of_noise(
-    noise: Map, total: Map, taps: Map, slope_taps: Map, law: str, *, is_variance: bool = False
-) -> Map:
+    noise: Floats, total: Floats, taps: Floats, slope_taps: Floats, law: str, *, is_variance: bool = False
+) -> Floats:
     """Noise in the mean Fisher information per pulse, in 1/bins²: of the bins, or the variance of independent ones."""
     from scipy.ndimage import convolve1d
 
@@ -141,7 +136,7 @@ class ResultBound(NamedTuple):
     pixel has information; `problem`: why the bound is not to be used, in words, else None.
     """
 
-    sigma: Map
+    sigma: Floats
     noise: float
     problem: str | None
 
@@ -194,7 +189,7 @@ def crlb(
     pulses: float | None = None,
     law: Literal["poisson", "first_photon"] = "first_photon",
     device: Any = None,
-) -> Map:
+) -> Floats:
     """Cramér–Rao bound of a Monte Carlo result's delay per pixel, float64 `[H, W]` [s]; NaN for no information.
 
     The scattered return moves with the target and counts as signal; backscatter, dark counts and ambient light do not.

@@ -11,7 +11,8 @@ from typing import Any, Literal
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from spadwarp.arrays import histogram_rows, in_torch_order, is_torch, on_host, real_array, tensor_of
+import spadwarp_kernels as sk
+from spadwarp.arrays import as_warp, histogram_rows, in_torch_order, is_torch, on_host, real_array, tensor_of
 from spadwarp.frames.backgrounds import BackgroundLaw, estimate_background
 from spadwarp.frames.response import InstrumentResponse
 from spadwarp.result import Result
@@ -111,8 +112,6 @@ def arrival_time(
     """
     import warp as wp
 
-    from spadwarp_kernels import detection as kernels
-
     check_choice("method", method, METHODS)
     gate_start = check_real("gate_start", gate_start, TIME)
     bin_width = check_real("bin_width", bin_width, BIN_WIDTH)
@@ -134,7 +133,7 @@ def arrival_time(
             half_width = max(1, int(np.ceil(1.5 * fwhm)))
             offset = {"peak": irf.mode / bin_width, "centroid": irf.mean / bin_width}.get(method, 0.0)
         if irf is not None and filtered:
-            response, lowest_tap = _response_table(irf, bin_width, kernels.PHASES)
+            response, lowest_tap = _response_table(irf, bin_width, sk.detection.PHASES)
         known = None if background is None else _background_rows(background, rows, frame)
         options: dict[str, Any] = {"first": first, "stop": stop, "half_width": half_width, "lowest_tap": lowest_tap}
         if min_significance is not None:
@@ -148,7 +147,7 @@ def arrival_time(
                 options["profile"] = known if given else _background_shape(rows, frame, first, stop, fwhm)
         elif min_significance:
             raise ArgumentError(f"min_significance = {min_significance} needs counts, integers; these are rates")
-        found = kernels.arrival_bins(rows, method=method, background=known, response=response, **options)
+        found = sk.detection.arrival_bins(rows, method=method, background=known, response=response, **options)
         position: Any = tensor_of(found).double() if is_torch(histogram) else found.numpy().astype(np.float64)
         if significance is not None and "significance" in options:
             if not hasattr(significance, "dtype"):
@@ -189,12 +188,10 @@ def _background_shape(rows: Any, frame: tuple[int, ...], first: int, stop: int, 
 
     One count more keeps it from 0.
     """
-    import warp as wp
-
     shape = np.ones((1, rows.shape[1]), np.float32)
     counts = rows.numpy()[:, first:stop].reshape(-1, *(1, *frame)[-2:], stop - first)
     shape[0, first:stop] = estimate_background(counts, fwhm).per_bin + 1.0 / len(rows)
-    return wp.array(shape, dtype=wp.float32, device=rows.device)
+    return as_warp(shape, name="background", device=rows.device)
 
 
 def _response_table(irf: InstrumentResponse, bin_width: float, phases: int) -> tuple[NDArray[np.float64], int]:

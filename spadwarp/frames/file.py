@@ -11,7 +11,7 @@ from typing import Any, ClassVar, Literal, NamedTuple, Self
 import numpy as np
 from numpy.typing import NDArray
 
-from spadwarp.arrays import Variable
+from spadwarp.arrays import Floats, Variable
 from spadwarp.device import pick_devices
 from spadwarp.frames.cramer_rao import ResultBound, bound_of_result, photons_for_noise
 from spadwarp.frames.depth import METHODS, Method
@@ -38,7 +38,6 @@ from spadwarp.values import SEED, ArgumentError, ConfigError, FileError, Spadwar
 __all__ = ["FrameErrors", "FramesFile", "Recording", "SequenceFile", "is_frames_file", "record_frames"]
 __all__ += ["simulate_sequence"]
 
-Map = NDArray[np.float64]
 Progress = Callable[[str, int, int], None]
 
 FORMAT_VERSION = 1
@@ -223,7 +222,7 @@ class FramesFile(_StoredFrames):
             **{name: getattr(self, name) for name in _OF_A_FRAME},
         )
 
-    def bound_depth(self) -> Map:
+    def bound_depth(self) -> Floats:
         """Cramér–Rao bound of one frame [m], `[H, W]`; NaN where there is no information."""
         with read_hdf5(self.path, self.FORMAT) as file:
             return file.array("bound/depth", np.float64, self.shape[1:3])
@@ -286,7 +285,9 @@ class _Writer:
     def __init__(self, file: Any, frames: int) -> None:
         self._file, self._frames, self._written = file, frames, 0
 
-    def add(self, part: Frames, scene: Scene, depth: Mapping[Method, Map], significance: Any, layout: _Layout) -> None:
+    def add(
+        self, part: Frames, scene: Scene, depth: Mapping[Method, Floats], significance: Any, layout: _Layout
+    ) -> None:
         """Writes the next frames, their tags, and their depth by each estimator `[frames, H, W]` [m]."""
         every: dict[str, Variable] = {
             "counts": ((*_IMAGES, "time"), part.counts, "1", "detections in the bin"),
@@ -365,7 +366,7 @@ class FrameErrors:
     p90: float
 
     @classmethod
-    def of(cls, depth: Map, truth: NDArray[np.float32]) -> Self:
+    def of(cls, depth: Floats, truth: NDArray[np.float32]) -> Self:
         """Of depth `[frames, H, W]` against the truth `[H, W]` [m]."""
         error = np.abs(depth - truth)[:, np.isfinite(truth)]
         known = error[np.isfinite(error)]
@@ -419,11 +420,8 @@ def record_frames(
     size = max(1, _PART_BYTES // (4 * scene.camera.width * scene.camera.height * bins))
     options: dict[str, Any] = {"pulses": pulses, "seed": seed, "tags": tags, "window": window, "device": device}
 
-    def remark(text: str) -> None:
-        if progress is not None:
-            progress(text, 0, 0)
-
-    remark("Cramér–Rao bound")
+    report = (lambda step, done, total: None) if progress is None else progress
+    report("Cramér–Rao bound", 0, 0)
     bound = _bound(result, pulses, device)
     notes = () if bound.problem is None else (f"no Cramér–Rao bound: {bound.problem}",)
     errors: dict[Method, FrameErrors] = {}
@@ -433,25 +431,24 @@ def record_frames(
         writer = _Writer(opened, frames)
         for start in range(0, frames, size):
             number = min(size, frames - start)
-            remark(f"counts of frames {start + 1} to {start + number} of {frames}")
+            report(f"counts of frames {start + 1} to {start + number} of {frames}", 0, 0)
             with warnings.catch_warnings():
                 if start:  # all parts say the same
                     warnings.simplefilter("ignore", SpadwarpWarning)
                 part = detect(result, frames=number, first_frame=start, **options)
             part = replace(part, notes=(*part.notes, *notes))
-            depth: dict[Method, Map] = {}
+            depth: dict[Method, Floats] = {}
             found: dict[str, Any] = {"significance": np.zeros(part.counts.shape[:-1], np.float32), "device": device}
             for method in methods:
                 if not start:
-                    remark(f"their depth by {method}")
+                    report(f"their depth by {method}", 0, 0)
                 time = part.arrival_time(method, undo_pile_up=undo_pile_up, **found)
                 depth[method] = depth_from_time(time, scene=scene)
             still = still or _still(result, part, frames, bound.sigma)
             writer.add(part, scene, depth, found["significance"], still)
             detections += int(part.intensity.sum())
             errors = errors or {name: FrameErrors.of(values, result.truth.depth) for name, values in depth.items()}
-            if progress is not None:
-                progress("frames", start + part.frames, frames)
+            report("frames", start + part.frames, frames)
     return Recording(
         file=FramesFile.load(path),
         errors=errors,
@@ -461,7 +458,7 @@ def record_frames(
     )
 
 
-def _still(result: Result, part: Frames, frames: int, bound: Map) -> _Layout:
+def _still(result: Result, part: Frames, frames: int, bound: Floats) -> _Layout:
     """What the file of a scene that stands still holds beside its frames: see `_Layout`."""
     scene, irf, distance = result.scene, part.irf, result.truth.range.astype(np.float64)
     attributes = {

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
 from typing import NamedTuple
@@ -37,8 +37,6 @@ class InstrumentResponse:
     tail: float = 0.0  # time constant of the exponential [s], 0: none
     times: ArrayLike | None = None  # of a measured curve instead: ascending [s]
     values: ArrayLike | None = None  # the curve at these times, ≥ 0, of any scale
-    _knots: Floats = field(init=False, repr=False, default_factory=lambda: np.empty(0))
-    _heights: Floats = field(init=False, repr=False, default_factory=lambda: np.empty(0))
 
     def __post_init__(self) -> None:
         for name in ("sigma", "tail"):
@@ -60,8 +58,7 @@ class InstrumentResponse:
         if not 1e-300 < area < 1e300:
             raise ArgumentError(f"times of a measured response ({times[0]} … {times[-1]} s) have no usable length")
         values /= area
-        for name, array in {"times": times, "values": values, "_knots": times, "_heights": values}.items():
-            object.__setattr__(self, name, array)
+        vars(self).update(times=times, values=values)
 
     # The curve
 
@@ -69,7 +66,7 @@ class InstrumentResponse:
         """Probability density [1/s]; a delta has none (ValueError)."""
         t = np.asarray(time, np.float64)
         if self.times is not None:
-            return np.interp(t, self._knots, self._heights, left=0.0, right=0.0)
+            return np.interp(t, self._curve[0], self._curve[1], left=0.0, right=0.0)
         if self.tail > 0:
             return self._tail_density(t)
         if self.sigma == 0:
@@ -80,8 +77,8 @@ class InstrumentResponse:
         """Integral of the density up to `time`."""
         t = np.asarray(time, np.float64)
         if self.times is not None:
-            i, x = self._segment(t)
-            return self._cumulative_at[i] + x * (self._heights[i] + 0.5 * x * self._slopes[i])
+            x, height, slope, before, _ = self._piece(t)
+            return before + x * (height + 0.5 * x * slope)
         gaussian = _gaussian_cumulative(t, self.sigma)
         return gaussian if self.tail == 0 else gaussian - self.tail * self._tail_density(t)
 
@@ -89,9 +86,9 @@ class InstrumentResponse:
         """Integral of `cumulative` up to `time` [s]."""
         t = np.asarray(time, np.float64)
         if self.times is not None:
-            i, x = self._segment(t)
-            inside = x * (self._cumulative_at[i] + x * (0.5 * self._heights[i] + x * self._slopes[i] / 6.0))
-            return self._integral_at[i] + inside + np.maximum(t - self._knots[-1], 0.0)
+            x, height, slope, before, integral = self._piece(t)
+            inside = x * (before + x * (0.5 * height + x * slope / 6.0))
+            return integral + inside + np.maximum(t - self._curve[0][-1], 0.0)
         if self.sigma == 0:
             gaussian = np.maximum(t, 0.0)
         else:
@@ -127,20 +124,20 @@ class InstrumentResponse:
     def support(self) -> tuple[float, float]:
         """(lower, upper) [s]: all but 1e-7 of the response lies between."""
         if self.times is not None:
-            return float(self._knots[0]), float(self._knots[-1])
+            return float(self._curve[0][0]), float(self._curve[0][-1])
         side = _SUPPORT_SIGMAS * self.sigma
         return -side, side + _SUPPORT_TAILS * self.tail
 
     @cached_property
     def mean(self) -> float:
         """Mean delay [s]."""
-        return self.tail if self.times is None else float(self._knots[-1] - self._integral_at[-1])
+        return self.tail if self.times is None else float(self._curve[0][-1] - self._curve[4][-1])
 
     @cached_property
     def mode(self) -> float:
         """Delay at which the density is largest [s]."""
         if self.times is not None:
-            return float(self._knots[self._heights.argmax()])
+            return float(self._curve[0][self._curve[1].argmax()])
         return 0.0 if self.tail == 0 or self.sigma == 0 else self._peak[0]
 
     @cached_property
@@ -174,24 +171,20 @@ class InstrumentResponse:
     # The measured curve
 
     @cached_property
-    def _slopes(self) -> Floats:
-        return np.append(np.diff(self._heights) / np.diff(self._knots), 0.0)
+    def _curve(self) -> tuple[Floats, ...]:
+        """At its points: times, density, slope of the density behind them, its integral, and the integral of that."""
+        times, density = np.asarray(self.times, np.float64), np.asarray(self.values, np.float64)
+        width = np.diff(times)
+        cumulative = np.append(0.0, np.cumsum(0.5 * width * (density[1:] + density[:-1])))
+        pieces = width * (cumulative[:-1] + width * (2 * density[:-1] + density[1:]) / 6.0)
+        return times, density, np.append(np.diff(density) / width, 0.0), cumulative, np.append(0.0, np.cumsum(pieces))
 
-    @cached_property
-    def _cumulative_at(self) -> Floats:
-        return np.append(0.0, np.cumsum(0.5 * np.diff(self._knots) * (self._heights[1:] + self._heights[:-1])))
-
-    @cached_property
-    def _integral_at(self) -> Floats:
-        width, height = np.diff(self._knots), self._heights
-        pieces = width * (self._cumulative_at[:-1] + width * (2 * height[:-1] + height[1:]) / 6.0)
-        return np.append(0.0, np.cumsum(pieces))
-
-    def _segment(self, t: Floats) -> tuple[NDArray[np.intp], Floats]:
-        """Index of the piece that holds `t` and the time since its start; outside all pieces, the nearer end."""
-        clipped = np.clip(t, self._knots[0], self._knots[-1])
-        i = np.clip(np.searchsorted(self._knots, clipped, side="right") - 1, 0, self._knots.size - 2)
-        return i, clipped - self._knots[i]
+    def _piece(self, t: Floats) -> tuple[Floats, ...]:
+        """Time since the start of the piece that holds `t`, outside all of the nearer end, and `_curve` there."""
+        knots = self._curve[0]
+        clipped = np.clip(t, knots[0], knots[-1])
+        i = np.clip(np.searchsorted(knots, clipped, side="right") - 1, 0, knots.size - 2)
+        return clipped - knots[i], *(part[i] for part in self._curve[1:])
 
 
 def _gaussian_cumulative(t: Floats, sigma: float) -> Floats:

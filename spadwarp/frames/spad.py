@@ -9,14 +9,17 @@ from __future__ import annotations
 import math
 import os
 import warnings
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, NamedTuple, Self
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+import spadwarp_kernels as sk
 from spadwarp.arrays import (
     Variable,
+    as_warp,
     histogram_rows,
     in_torch_order,
     is_torch,
@@ -33,16 +36,7 @@ from spadwarp.result.analysis import UNKNOWN_NOISE, noise_problem, with_frames
 from spadwarp.result.file import as_result
 from spadwarp.result.result import Result, Truth
 from spadwarp.scene import Detector, Laser, detection_efficiency, noise_rate
-from spadwarp.values import (
-    BIN_WIDTH,
-    SEED,
-    TIME,
-    ArgumentError,
-    Shown,
-    SpadwarpWarning,
-    check_integer,
-    check_real,
-)
+from spadwarp.values import BIN_WIDTH, SEED, TIME, ArgumentError, Shown, SpadwarpWarning, check_integer, check_real
 
 if TYPE_CHECKING:
     import xarray
@@ -128,12 +122,8 @@ class Receiver:
 
         `device` is a Warp device; the others are arguments of `spadwarp.detect`. Raises `ArgumentError`.
         """
-        import warp as wp
-
-        from spadwarp_kernels import detection as kernels
-
         seen = Window.of(detector, laser, window or (axis[0], shape[2]), axis[1], tdc_widths)
-        noise: Any = kernels.dark_count_rates(
+        noise: Any = sk.detection.dark_count_rates(
             shape[0] * shape[1],
             median=detector.dark_count_rate,
             spread=detector.dark_count_spread,
@@ -146,7 +136,7 @@ class Receiver:
         if ambient is not None:
             values = real_array("ambient", ambient, np.float64, shapes=((), shape[:2]), within="[0, inf)")
             rates = noise.numpy() + np.broadcast_to(values, shape[:2]).reshape(-1)
-            noise = wp.array(rates.astype(np.float32), dtype=wp.float32, device=noise.device)
+            noise = as_warp(rates.astype(np.float32), name="ambient", device=noise.device)
         matrix = response_matrix(
             detector_response(detector, laser) if irf is None else irf,
             source_start=axis[0],
@@ -160,52 +150,43 @@ class Receiver:
 
     def light(self, rows: Any, noise: Any = None) -> Any:
         """Light and noise in the detector's bins before its effects, Warp float32 `[pixel, bin]`, of source rows."""
-        from spadwarp_kernels import detection as kernels
-
         options = {"width": np.diff(self.window.edges), "noise_rate": self.noise if noise is None else noise}
-        return kernels.expected_detections(rows, **self.matrix._asdict(), **options)
+        return sk.detection.expected_detections(rows, **self.matrix._asdict(), **options)
 
     def hazard(self, rows: Any) -> Any:
         """λ: expected detections per pulse and bin of a detector that is always ready, Warp float32 `[pixel, bin]`."""
-        hazard = self.light(rows)
-        if self.detector.crosstalk_probability > 0:
-            self._add_crosstalk(hazard, self.detections(hazard))
-        return hazard
+        return self._with_crosstalk(self.light(rows), self.detections)
 
-    def _add_crosstalk(self, rates: Any, neighbours: Any) -> None:
-        """λ, or its slope, gains a part of the detections of the four neighbours, in place."""
-        from spadwarp_kernels import detection as kernels
-
-        probability = self.detector.crosstalk_probability
-        kernels.add_crosstalk(rates, neighbours, image_width=self.image[1], probability=probability)
+    def _with_crosstalk(self, rates: Any, neighbours: Callable[[Any], Any]) -> Any:
+        """λ, or its slope, with a part of the detections of the four neighbours, which follow from it; in place."""
+        if (probability := self.detector.crosstalk_probability) > 0:
+            others = neighbours(rates)
+            sk.detection.add_crosstalk(rates, others, image_width=self.image[1], probability=probability)
+        return rates
 
     def detections(self, hazard: Any) -> Any:
         """Expected detections per pulse of λ with pile-up, Warp float32 of the same shape."""
-        from spadwarp_kernels import detection as kernels
-
         if self.detector.mode != "free_running":
-            return kernels.first_photon_probabilities(hazard)
+            return sk.detection.first_photon_probabilities(hazard)
         dead_time = self.detector.dead_time_ns * 1e-9
-        return kernels.free_running_probabilities(hazard, dead_time=dead_time, period=self.window.period)
+        return sk.detection.free_running_probabilities(hazard, dead_time=dead_time, period=self.window.period)
 
     def background(self, rows: Any) -> Any:
         """λ of what is not target, with its own crosstalk and afterpulses, Warp float32 `[pixel, bin]`, of source rows
         of backscatter or None; of dark counts and ambient light alone `[pixel, 1]` where all bins are alike."""
-        import warp as wp
-
         probability, device = self.detector.afterpulsing_probability, self.noise.device
         if rows is None:
             if not (probability or self.detector.crosstalk_probability):
                 widths = np.diff(self.window.edges[: 2 if self.equal_bins else self.window.recorded + 1])
-                return wp.array((self.noise.numpy()[:, None] * widths).astype(np.float32), device=device)
+                return as_warp((self.noise.numpy()[:, None] * widths).astype(np.float32), name="noise", device=device)
             shape = self.noise.size, int(self.matrix.source_bin.max(initial=0)) + 1
-            rows = wp.zeros(shape, dtype=float, device=device)
+            rows = as_warp(np.zeros(shape, np.float32), name="background", device=device)
         known = found = self.hazard(rows)
         if probability:
             share = (probability * self._afterpulse_share()).astype(np.float32)
             for _ in range(math.ceil(math.log(1e-4, probability))):  # afterpulses have afterpulses
                 more = self.detections(found).numpy() @ share
-                found = wp.array(known.numpy() + more, dtype=float, device=device)
+                found = as_warp(known.numpy() + more, name="background", device=device)
         return found
 
     def _afterpulse_share(self) -> NDArray[np.float64]:
@@ -221,25 +202,19 @@ class Receiver:
         return np.diff(turns - np.expm1(-time / delay) / whole, axis=1)
 
     def slope(self, rows: Any) -> Any:
-        """Derivative of λ by what changes the source by `rows` `[pixel, source bin]`, which may be negative."""
+        """Derivative of λ by what changes the source by `rows` `[pixel, source bin]`, which may be negative; with
+        crosstalk as if the pile-up of the neighbours stayed as it is."""
         import warp as wp
 
-        return self._followed(self.light(rows, wp.zeros(rows.shape[0], dtype=wp.float32, device=rows.device)))
+        none = wp.zeros(rows.shape[0], dtype=wp.float32, device=rows.device)
+        return self._with_crosstalk(self.light(rows, none), wp.clone)
 
     def noise_slope(self) -> Any:
-        """Derivative of λ by a noise rate [1/s] that all pixels share."""
+        """Derivative of λ by a noise rate [1/s] that all pixels share; crosstalk as in `slope`."""
         import warp as wp
 
         widths = np.tile(np.diff(self.window.edges).astype(np.float32), (self.image[0] * self.image[1], 1))
-        return self._followed(wp.array(widths, device=self.noise.device))
-
-    def _followed(self, slope: Any) -> Any:
-        """With crosstalk, as if the pile-up of the neighbours stayed as it is."""
-        import warp as wp
-
-        if self.detector.crosstalk_probability > 0:
-            self._add_crosstalk(slope, wp.clone(slope))
-        return slope
+        return self._with_crosstalk(wp.array(widths, device=self.noise.device), wp.clone)
 
 
 # Frames, and the law of their pile-up
@@ -252,13 +227,11 @@ def first_photon_probabilities(hazard: Any, *, device: Any = None) -> NDArray[np
     """
     import warp as wp
 
-    from spadwarp_kernels import detection as kernels
-
     with in_torch_order(hazard):
         rows, shape = histogram_rows(hazard, name="hazard", device=device)
         if rows.dtype not in (wp.float32, wp.float64):
             rows = wp.array(rows.numpy().astype(np.float64), device=rows.device)
-        law = kernels.first_photon_probabilities(rows)
+        law = sk.detection.first_photon_probabilities(rows)
         values: Any = tensor_of(law).double() if is_torch(hazard) else law.numpy().astype(np.float64)
     return values.reshape(shape)
 
@@ -271,23 +244,19 @@ def coates(counts: Any, *, pulses: int, device: Any = None) -> NDArray[np.float6
     `counts`: integers `[..., T]`, not negative; NumPy, torch or Warp; `pulses`: of each histogram, which may hold no
     more counts than that; `device`: of Warp.
     """
-    import warp as wp
-
-    from spadwarp_kernels import detection as kernels
-
     with in_torch_order(counts):
         rows, shape = histogram_rows(counts, name="counts", device=device)
-        if rows.dtype not in (wp.int32, wp.int64):
-            raise ArgumentError(f"counts are {rows.dtype.__name__}; integers are needed")
         values = rows.numpy()
+        if values.dtype.kind != "i":
+            raise ArgumentError(f"counts are {values.dtype}; integers are needed")
         if values.max() > 2**31 - 1:
             raise ArgumentError(f"counts = {values.max()} is above {2**31 - 1}")
         pulses = check_integer("pulses", pulses, "[1, 9007199254740992]")
         if (most := int(values.sum(axis=1, dtype=np.int64).max())) > pulses:
             raise ArgumentError(f"pulses = {pulses} is below the {most} counts of a histogram: more than one a pulse")
-        if rows.dtype != wp.int32:
-            rows = wp.array(values.astype(np.int32), dtype=wp.int32, device=rows.device)
-        corrected = kernels.coates(rows, pulses=pulses)
+        if values.dtype != np.int32:
+            rows = as_warp(values.astype(np.int32), name="counts", device=rows.device)
+        corrected = sk.detection.coates(rows, pulses=pulses)
         result: Any = tensor_of(corrected) if is_torch(counts) else corrected.numpy()
     return result.reshape(shape)
 
@@ -494,8 +463,6 @@ def detect(
     Raises:
         ArgumentError: Names the argument, its value and what is allowed.
     """
-    import warp as wp
-
     source = as_result(source) if isinstance(source, str | os.PathLike) else source
     result, scene = source, getattr(source, "scene", None)
     if scene is not None:
@@ -543,7 +510,7 @@ def detect(
             out_shape = (*(() if summed else (numbers["frames"],)), *image, seen.recorded)
             out = output_tensor(out, name="out", shape=out_shape, device=hazard.device)
         counts, found = _draw(receiver, hazard, numbers, summed=summed, tags=tags, out=out)
-        to_caller: Any = tensor_of if as_torch else wp.array.numpy
+        to_caller: Any = tensor_of if as_torch else (lambda rows: rows.numpy())
         expected, known = (to_caller(rows)[:, : seen.recorded].reshape(*image, -1) for rows in (hazard, known))
     notes = seen.missing_light(axis[0]) if detector.wrap else ()
     if (begin := 1e9 * seen.start) >= (end := 1e9 * (axis[0] + shape[2] * axis[1])):
@@ -578,19 +545,15 @@ def _draw(
     receiver: Receiver, hazard: Any, numbers: dict[str, int], *, summed: bool, tags: bool, out: Any
 ) -> tuple[Any, TimeTags | None]:
     """Counts, in the tensor `out` where there is one, and for tags the detections one by one."""
-    import warp as wp
-
-    from spadwarp_kernels import detection as kernels
-
     detector, window = receiver.detector, receiver.window
     by_event = detector.mode == "free_running" or tags or detector.afterpulsing_probability > 0
     add_frames = by_event and summed  # the kernel of events does not
     in_place = out is not None and not add_frames
-    given = wp.from_torch(out).flatten() if in_place else None
+    given = as_warp(out, name="out").flatten() if in_place else None
     common: dict[str, Any] = {**numbers, "counter_depth": detector.max_count, "counts": given}
     found = None
     if by_event:
-        counts, events = kernels.event_counts(
+        counts, events = sk.detection.event_counts(
             hazard,
             edges=window.edges,
             recorded=window.recorded,
@@ -607,7 +570,7 @@ def _draw(
             y, x = np.divmod(pixel, receiver.image[1])
             found = TimeTags(frame + numbers["first_frame"], y, x, events["pulse"], events["bin"])
     else:
-        counts = kernels.first_photon_counts(hazard, summed=summed, **common)
+        counts = sk.detection.first_photon_counts(hazard, summed=summed, **common)
     if in_place:
         return out, found
     every: Any = counts.numpy() if out is None else tensor_of(counts)

@@ -85,8 +85,7 @@ def analyser_channel(result: Result, channel: Channel) -> Result:
         batches=0 if moments is None else result.batches,
         batch_moments={},
         reconstruction=None,
-        channel_tallies=None,
-        derivative_tallies=None,
+        signed_tallies=None,
         provenance={**result.provenance, "channel": channel},
     )
 

@@ -16,8 +16,10 @@ from spadwarp.io.arrays import read_exr, write_exr
 from spadwarp.io.hdf5 import Coordinate, Hdf5File, image_chunks, name_dimensions, read_hdf5, write_hdf5, write_packed
 from spadwarp.io.paths import file_within
 from spadwarp.io.text import read_toml
+from spadwarp.result.photon_ids import joined
 from spadwarp.result.result import (
     ARRAYS,
+    DIMENSION_OF,
     TABLES,
     Reconstruction,
     Result,
@@ -26,16 +28,13 @@ from spadwarp.result.result import (
     arrays_of,
     coordinates_of,
     shape_of,
-    signed_of,
     water_of,
 )
 from spadwarp.result.tallies import (
     FluxTallies,
-    Range,
     SignedTallies,
     added,
     flux_arrays,
-    joined,
     moments_of,
     part_of,
     rebatched,
@@ -91,7 +90,8 @@ def save_result(result: Result, path: str | Path, *, compression: int = 1) -> Pa
     }
     with write_hdf5(path) as file:
         head = {"format": FORMAT, "format_version": FORMAT_VERSION, "read_me": TABLES["read_me"]}
-        names = {group: list(found.names) for group, found in signed_of(result).items()}
+        signed = result.signed_tallies
+        names: dict[str, Any] = {} if signed is None else {signed.group: list(signed.names)}
         file.attrs.update({**head, **_attributes(result), **names})
         for name, array in arrays.items():
             dimensions = _DIMENSIONS[name][0]
@@ -117,10 +117,7 @@ def load_result(path: str | Path) -> Result:
     """
     with read_hdf5(path, FORMAT, version=FORMAT_VERSION) as file:
         head = _head(file)
-        names = {group: _names(file, group) for group in ("derivatives", "channels")}
-        counts = {"parameter": len(names["derivatives"]), "channel": len(names["channels"])}
-        counts |= {"component": len(head.scene.components), "time": head.scene.gate.bins}
-        camera = head.scene.camera
+        camera, counts = head.scene.camera, {"component": len(head.scene.components), "time": head.scene.gate.bins}
 
         def array(name: str) -> Any:
             return file.array(name, ARRAYS[name][0], shape_of(name, camera.height, camera.width, **counts))
@@ -128,15 +125,18 @@ def load_result(path: str | Path) -> Result:
         def moment(name: str) -> Any:
             return array(name) if head.batch_size else None
 
-        def signed(group: str) -> SignedTallies | None:
-            if not names[group]:
-                return None
-            units = tuple(map(float, array(f"{group}/unit")))
-            return SignedTallies(names[group], array(f"{group}/tallies"), units, moment(f"{group}/second_moment"))
-
         tallies = array("tallies")
         if tallies.min() < 0:
             file.refuse("tallies", "are negative in some bins")
+        signed: Any = None
+        for group in ("derivatives", "channels"):
+            if group in file:
+                names = tuple(np.ravel(file.attribute(group)).tolist())
+                if not all(isinstance(name, str) for name in names) or len(set(names)) < len(names):
+                    file.refuse(group, "are not names")
+                counts[DIMENSION_OF[group]] = len(names)
+                units, moments = tuple(map(float, array(f"{group}/unit"))), moment(f"{group}/second_moment")
+                signed = SignedTallies(group, names, array(f"{group}/tallies"), units, moments)
         kept = Reconstruction.__dataclass_fields__ if "reconstruction" in file else ()
         light = {name: array(f"reconstruction/{name}") for name in kept}
         maps = {name: array(f"truth/{name}") for name in Truth.__dataclass_fields__}
@@ -163,8 +163,7 @@ def load_result(path: str | Path) -> Result:
             energy_balance=file.integers("energy_balance"),
             counters=file.integers("counters"),
             batch_moments=moments,
-            derivative_tallies=signed("derivatives"),
-            channel_tallies=signed("channels"),
+            signed_tallies=signed,
             flux_tallies=_read_flux(file, head) if head.scene.flux else None,
             timing=file.numbers("timing"),
             provenance=made,
@@ -248,14 +247,6 @@ def _head(file: Hdf5File) -> ResultHead:
         file_hashes=tuple(file.text_attribute("file_hashes", "").split()),
         focus_distance=None if np.isnan(focus) else focus,
     )
-
-
-def _names(file: Hdf5File, group: str) -> tuple[str, ...]:
-    """Of the derivatives or channels of a file; none without the group."""
-    names = tuple(np.ravel(file.attribute(group)).tolist()) if group in file else ()
-    if not all(isinstance(name, str) for name in names) or len(set(names)) < len(names):
-        file.refuse(group, "are not names")
-    return names
 
 
 def _attributes(result: Result) -> dict[str, Any]:
@@ -354,6 +345,11 @@ def merge(results: Iterable[ResultLike]) -> Result:
         if problem := difference(first, other):
             raise ConfigError(f"merge: {problem}")
     ranges = joined(ids for part in parts for ids in part.photon_ranges)
+    provenance = list[dict[str, Any]]()  # of each part, with its photon ids
+    for part in parts:
+        made = dict(part.provenance)
+        provenance += made.pop("parts", None) or [{**made, "photon_ranges": [list(ids) for ids in part.photon_ranges]}]
+    head = {name: value for name, value in provenance[0].items() if name != "photon_ranges"}
     size = max(part.batch_size for part in parts)
     total = total_of(*(rebatched(part, size // part.batch_size if size else 1) for part in parts))
     return replace(
@@ -363,21 +359,11 @@ def merge(results: Iterable[ResultLike]) -> Result:
         batch_size=size,
         photons=sum(part.photons for part in parts),
         timing=added(*(part.timing for part in parts)),
-        provenance=_joined_provenance((part.provenance, part.photon_ranges) for part in parts),
+        provenance=head if len(provenance) == 1 else {**head, "parts": provenance},
         partial=any(part.partial for part in parts),
         photon_ranges=ranges,
         requested=(min(part.requested[0] for part in parts), max(part.requested[1] for part in parts)),
     )
-
-
-def _joined_provenance(parts: Iterable[tuple[Mapping[str, Any], Iterable[Range]]]) -> dict[str, Any]:
-    """The first provenance, and under `parts` each with its photon ids."""
-    each: list[dict[str, Any]] = []
-    for provenance, ranges in parts:
-        made = dict(provenance)
-        each += made.pop("parts", None) or [{**made, "photon_ranges": [list(ids) for ids in ranges]}]
-    head = {name: value for name, value in each[0].items() if name != "photon_ranges"}
-    return head if len(each) == 1 else {**head, "parts": each}
 
 
 # Images

@@ -15,18 +15,16 @@ from numpy.typing import NDArray
 from spadwarp.arrays import Floats
 from spadwarp.io.hdf5 import Coordinate, image_coordinates
 from spadwarp.io.text import read_toml
+from spadwarp.result.photon_ids import count, photons_per_position
 from spadwarp.result.tallies import (
     GRID,
     NO_BATCHES,
-    SignedTallies,
     Tallies,
     block_parameters,
     check_flux,
-    count,
     flux_arrays,
     is_block_name,
     part_of,
-    photons_per_position,
 )
 from spadwarp.scene import Scene, noise_rate
 from spadwarp.scene.medium import NOTABLE_UNSEEN
@@ -63,7 +61,7 @@ _NARROW = 0.2  # standard deviation [bins] of a response that leaves light in it
 _PART_VOXELS = 1 << 22
 _SAMPLE = 1024  # pixels whose median stands for the target
 
-_DIMENSION_OF = {"derivatives": "parameter", "channels": "channel"}
+DIMENSION_OF = {"derivatives": "parameter", "channels": "channel"}
 
 TABLES = read_toml(Path(__file__).with_name("arrays.toml"))
 ARRAYS: dict[str, tuple[Any, tuple[str, ...], str, str]] = {
@@ -190,22 +188,22 @@ class Result(Shown, ResultHead, Tallies):
             raise ArgumentError(f"batches = {self.batches} of {self.batch_size} photons cannot be those of the run")
         if not 0 <= self.half_photons <= self.photons:
             raise ArgumentError(f"half_photons = {self.half_photons} is outside [0, {self.photons}]")
-        signed, expected = signed_of(self), self.scene.tallied_channels
-        channels = signed["channels"].names if "channels" in signed else ()
+        signed, expected = self.signed_tallies, self.scene.tallied_channels
+        channels = signed.names if signed is not None and signed.group == "channels" else ()
         if channels != expected:
             text = f"channels are {', '.join(channels) or 'none'}; those of the scene's camera are"
             raise ArgumentError(f"{text} {', '.join(expected) or 'none'}")
-        counts = {_DIMENSION_OF[group]: len(found.names) for group, found in signed.items()}
-        counts["component"] = len(self.scene.components)
-        camera, counts["time"] = self.scene.camera, self.scene.gate.bins
+        camera, counts = self.scene.camera, {} if signed is None else {DIMENSION_OF[signed.group]: len(signed.names)}
+        counts |= {"component": len(self.scene.components), "time": self.scene.gate.bins}
         for name, array in arrays_of(self).items():
             _check_array(name, array, shape_of(name, camera.height, camera.width, **counts))
         check_flux(self.scene, self.flux_tallies, self.batches)
         units = {"unit": self.unit, "energy_balance_unit": self.energy_balance_unit}
-        for group, found in signed.items():
-            if (found.second_moment is None) != (self.second_moment is None):
-                raise ArgumentError(f"{group} and tallies: both have a second moment, or none of them")
-            units |= {f"{group}: unit of {name}": unit for name, unit in zip(found.names, found.units, strict=True)}
+        if signed is not None:
+            if (signed.second_moment is None) != (self.second_moment is None):
+                raise ArgumentError(f"{signed.group} and tallies: both have a second moment, or none of them")
+            named = zip(signed.names, signed.units, strict=True)
+            units |= {f"{signed.group}: unit of {name}": unit for name, unit in named}
         for name, unit in units.items():
             if not (unit > 0 and math.frexp(unit)[0] == 0.5):
                 raise ArgumentError(f"{name} = {unit} is not a power of two")
@@ -358,10 +356,9 @@ class Result(Shown, ResultHead, Tallies):
         """
         if self.half is None or not 0 < self.half_photons < self.photons:
             raise ConfigError(NO_BATCHES)
-        rest = self.photons - self.half_photons
-        return Half(self.half, self.half_photons, self.tally_value * (self.photons / self.half_photons)), Half(
-            self.tallies - self.half, rest, self.tally_value * (self.photons / rest)
-        )
+        parts = (self.half, self.half_photons), (self.tallies - self.half, self.photons - self.half_photons)
+        even, odd = (Half(part, photons, self.tally_value * (self.photons / photons)) for part, photons in parts)
+        return even, odd
 
     @cached_property
     def noise_ratio(self) -> Floats:
@@ -550,12 +547,6 @@ class Result(Shown, ResultHead, Tallies):
         return spadwarp.result.save_result(self, path)
 
 
-def signed_of(result: Result) -> dict[str, SignedTallies]:
-    """Those of derivatives and channels that there are."""
-    groups = {"derivatives": result.derivative_tallies, "channels": result.channel_tallies}
-    return {group: found for group, found in groups.items() if found is not None}
-
-
 def _number(result: Result, name: Component) -> int:
     """That of a component."""
     names = result.scene.components
@@ -567,9 +558,9 @@ def arrays_of(result: Result) -> dict[str, NDArray[Any]]:
     found: dict[str, Any] = {name: getattr(result, name) for name in ("tallies", "half", "second_moment")}
     if result.reconstruction is not None:
         found |= {f"reconstruction/{name}": values for name, values in vars(result.reconstruction).items()}
-    for group, signed in signed_of(result).items():
-        found |= {f"{group}/tallies": signed.tallies, f"{group}/second_moment": signed.second_moment}
-        found[f"{group}/unit"] = np.array(signed.units)
+    if (signed := result.signed_tallies) is not None:
+        parts = {"tallies": signed.tallies, "second_moment": signed.second_moment, "unit": np.array(signed.units)}
+        found |= {f"{signed.group}/{name}": values for name, values in parts.items()}
     found |= {f"truth/{name}": values for name, values in vars(result.truth).items()}
     return {name: array for name, array in found.items() if array is not None}
 
@@ -604,10 +595,10 @@ class Cube(NamedTuple):
 
 def cubes_of(result: Result, group: str) -> dict[str, Cube]:
     """Of derivatives or of the camera's channels, by name; the channel "I" is the histogram."""
-    found, cubes = signed_of(result).get(group), dict[str, Cube]()
+    found, cubes = result.signed_tallies, dict[str, Cube]()
     if group == "channels" and "I" in result.scene.camera.channels:
         cubes["I"] = Cube(result.tallies, result.unit, result.second_moment)
-    if found is not None:
+    if found is not None and found.group == group:
         moments = [None] * len(found.names) if found.second_moment is None else found.second_moment.swapaxes(0, 1)
         parts = zip(found.names, found.tallies, found.units, moments, strict=True)
         cubes |= {name: Cube(*cube) for name, *cube in parts}
@@ -783,17 +774,17 @@ def _noise_ratios(result: Result, pixels: NDArray[np.intp]) -> Floats:
     tallies, moments = result.tallies.reshape(components, -1, bins), result.known_moment.reshape(2, -1, bins)
     size = max(1, _PART_VOXELS // bins)
     scene, value, better = result.scene, result.tally_value.reshape(-1), result.reconstruction
+    per_pulse = scene.laser.photons_per_pulse * scene.detections_per_photon
     target = np.isfinite(result.truth.depth).reshape(-1)
     noise = np.broadcast_to(noise_rate(scene, result.truth), (*result.truth.depth.shape, 1)).reshape(-1)
     ratios = np.full(len(pixels), np.nan)
     for first in range(0, len(pixels), size):
         part = pixels[first : first + size]
-        mine = tallies[:, part]
-        scale = (value[part] * (scene.laser.photons_per_pulse * scene.detections_per_photon))[:, None]
         if better is None:
+            mine, scale = tallies[:, part], (value[part] * per_pulse)[:, None]
             error = result.batch_error(mine, moments[:, part]) * scale
         else:
-            scale = np.full((1, 1), scene.laser.photons_per_pulse * scene.detections_per_photon)
+            scale = np.full((1, 1), per_pulse)
             mine = better.histogram.reshape(components, -1, bins)[:, part].astype(np.float64)
             error = better.error.reshape(-1, bins)[part] * scale
         light = mine.sum(axis=0) * scale

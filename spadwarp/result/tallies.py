@@ -1,13 +1,13 @@
-"""Tallies of photons as integers, whose sums do not depend on their order, and the ids of the photons."""
+"""Tallies of photons as integers, whose sums do not depend on their order."""
 
 from __future__ import annotations
 
 import itertools
 import operator
 import re
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from typing import Any, NamedTuple, TypeVar
+from typing import Any, Literal, NamedTuple, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -25,15 +25,16 @@ OVERFLOW = (
 
 NO_BATCHES = "the result has no errors: fewer than two batches of photons were kept; simulate with more photons"
 
-GROUPS = ("derivative_tallies", "channel_tallies", "flux_tallies")
+GROUPS = ("signed_tallies", "flux_tallies")
 
 Number = TypeVar("Number", int, float)
 
 
 @dataclass(frozen=True, eq=False)
 class SignedTallies:
-    """Tallies of the derivatives of a histogram, or of channels."""
+    """Tallies of the derivatives of a histogram, or of channels: a run has one of the two groups at most."""
 
+    group: Literal["derivatives", "channels"]
     names: tuple[str, ...]  # of the P parameters, such as "medium.absorption", or channels, such as "cross"
     tallies: NDArray[np.int64]  # int64 `[P, 3, H, W, T]`, by component; derivative or channel = tally · unit / photons
     units: tuple[float, ...]
@@ -73,8 +74,8 @@ class Tallies:
     batch_moments: Mapping[str, int] = field(default_factory=dict)
     """By component, over batches of its tally summed over voxels: `…_squares` (their sum, as that of `second_moment`),
     and over batches of `batch_size` photons `…_smallest` and `…_largest`; empty without batches."""
-    derivative_tallies: SignedTallies | None = None  # of the derivatives that were asked for; None if there are none
-    channel_tallies: SignedTallies | None = None  # of the camera's channels but "I", the histogram; None: no others
+    signed_tallies: SignedTallies | None = None
+    """Of the derivatives that were asked for, or of the channels but "I", the histogram; None if there are none."""
     flux_tallies: FluxTallies | None = None  # of the scene's sections of flux; None if there are none
 
     @property
@@ -117,7 +118,7 @@ def _group_total(parts: Sequence[Any]) -> Any:
     if not found:
         return None
     first, of_flux = found[0], isinstance(found[0], FluxTallies)
-    kinds = set() if of_flux else {(part.names, part.units) for part in found}
+    kinds = set() if of_flux else {(part.group, part.names, part.units) for part in found}
     if len(found) < len(parts) or len(kinds) > 1:
         raise ConfigError("the results have tallies of different derivatives, channels or flux")
     tallies, second_moment = _added_arrays(found)
@@ -247,99 +248,6 @@ def block_parameters(names: Sequence[str]) -> BlockParameters:
             "give blocks, the number of them along the edges"
         )
     return whole
-
-
-# Photon ids, as [start, stop)
-
-Range = tuple[int, int]
-Ranges = tuple[Range, ...]
-
-
-def joined(ranges: Iterable[Range]) -> Ranges:
-    """The ranges in order, adjoining ones made one.
-
-    Raises `ConfigError`: ids are in more than one of them.
-    """
-    whole: list[Range] = []
-    for start, stop in sorted(ranges):
-        if whole and start < whole[-1][1]:
-            raise ConfigError(f"photon ids {start} to {min(stop, whole[-1][1]) - 1} are in more than one result")
-        if whole and start == whole[-1][1]:
-            whole[-1] = (whole[-1][0], stop)
-        elif start < stop:
-            whole.append((start, stop))
-    return tuple(whole)
-
-
-def without(span: Range, done: Ranges) -> Ranges:
-    """The parts of a span that are not in `done`, which are joined ranges."""
-    left: list[Range] = []
-    start, stop = span
-    for first, last in done:
-        if start < min(first, stop):
-            left.append((start, min(first, stop)))
-        start = max(start, last)
-    if start < stop:
-        left.append((start, stop))
-    return tuple(left)
-
-
-def count(ranges: Iterable[Range]) -> int:
-    """How many ids there are."""
-    return sum(stop - start for start, stop in ranges)
-
-
-def shard_of(span: Range, shard: tuple[int, int], unit: int) -> Range:
-    """Part `shard[0]`, from 1, of `shard[1]` nearly equal parts of a span, cut at multiples of a unit.
-
-    Raises `ConfigError`: there are more parts than units.
-    """
-    (number, parts), (start, stop) = shard, span
-    units = (stop - start) // unit
-    if units < parts:
-        raise ConfigError(f"shard = {number}/{parts}: {stop - start} photons are {units} units of {unit}, too few")
-    inner = [unit * (start // unit + units * part // parts) for part in range(1, parts)]
-    edges = [start, *inner, stop]
-    return edges[number - 1], edges[number]
-
-
-class IdQueue:
-    """Ids that wait, taken from the front; those of lost workers are put back."""
-
-    def __init__(self, ranges: Iterable[Range]) -> None:
-        self._ranges = list[Range]()
-        self.put_back(ranges)
-
-    def take(self, size: int, unit: int = 1) -> Range | None:
-        """At most `size` ids, up to a multiple of `unit` where more are left; None if none are left."""
-        if not self._ranges:
-            return None
-        start, stop = self._ranges.pop()
-        end = (start // unit + max(size // unit, 1)) * unit
-        if stop > end:
-            self._ranges.append((end, stop))
-            stop = end
-        self.left -= stop - start
-        return start, stop
-
-    def put_back(self, ranges: Iterable[Range]) -> None:
-        """Ids that are to be done again."""
-        self._ranges = sorted([*self._ranges, *ranges], reverse=True)
-        self.left = count(self._ranges)
-
-
-def photons_per_position(scene: Scene, photon_ranges: Sequence[Range]) -> NDArray[np.float64]:
-    """Photons whose light each pixel may hold, float64 `[H, W]`: all of them, or in a scan those of its position, but 1
-    at least."""
-    shape = (scene.camera.height, scene.camera.width)
-    if scene.scan_positions == 1:
-        return np.full(shape, float(count(photon_ranges)))
-    positions = scene.scan_positions
-    position = np.arange(positions)
-    photons = np.zeros(positions)
-    for start, stop in photon_ranges:  # ids that are the position modulo the number of positions
-        photons += (stop - position + positions - 1) // positions - (start - position + positions - 1) // positions
-    return np.repeat(np.maximum(photons, 1.0), shape[0] * shape[1] // positions).reshape(shape)
 
 
 # Flux, of all sections one after another

@@ -25,7 +25,7 @@ from spadwarp.scene.port import PortGeometry
 from spadwarp.scene.pose import rotation_matrix, sideways, vector_of
 from spadwarp.scene.scan import Shots, shots_of
 from spadwarp.scene.scene import camera_port, laser_port, mean_plane
-from spadwarp.scene.sight import lines_of_sight, scan_axes, view_directions, within_port
+from spadwarp.scene.sight import lines_of_sight, scan_axes, within_port
 from spadwarp.transport.derivatives import derivative_kinds, make_derivatives
 from spadwarp.transport.plan import tally_limits
 from spadwarp.values import ArgumentError, ConfigError, DeviceError
@@ -67,8 +67,10 @@ def build_model(
     `DeviceError`: the device has too little memory.
     """
     _check_places(scene, mesh, camera)
-    if camera:
-        _check_gate(scene)
+    begin, max_path = scene.gate.start * scene.medium.pulse_speed, scene.transport.max_path
+    if camera and max_path is not None and max_path <= begin:
+        text = f"transport.max_path = {max_path} m is outside ({begin:g}, inf) m, the path at which the gate begins"
+        raise ConfigError(text, source=scene.source)
     if scale is None:
         scale = tally_limits(scene, mesh).scale if camera else 1.0
     sea = None if scene.surface is None else _sea(scene, device)
@@ -87,10 +89,13 @@ def build_model(
         parts["derivatives"] = make_derivatives(scene, derivatives, mesh, scale, device, grid)
     if sea is not None:
         parts["sea"] = sea
+    scales = [scale] * len(scene.tallied_channels)
     if scene.polarised:
-        parts |= _polarised(scene, mesh, scale, device)
+        parts["polarisation"] = _polarisation(scene, mesh, device)
     if scene.medium.inelastic or scene.medium.beside:
-        parts |= _lines(scene, scale, device)
+        parts["lines"], scales = _lines(scene, scale, device)
+    if scales:
+        parts["derivatives"] = sk.make_derivatives([], [], scales, channels=len(scales), device=device)
     if camera and scene.flux:
         parts["flux"] = _flux(scene, device)
     model = sk.Model(
@@ -515,23 +520,19 @@ def _has_rotated_domain(scene: Scene) -> bool:
     return scene.domain.shape != "unbounded" and any(scene.camera.rotation_deg)
 
 
-def _polarised(scene: Scene, mesh: TriangleMesh | None, scale: float, device: wp.Device) -> dict[str, Any]:
-    """Polarised light of the model, and tallies of the camera's channels in the unit of its histogram."""
+def _polarisation(scene: Scene, mesh: TriangleMesh | None, device: wp.Device) -> Any:
+    """Polarised light of the model, and the camera's channels of it."""
     rows, facets = _channel_rows(scene.camera), ()  # type: tuple[Any, Any]
     if mesh is not None and mesh.specular is not None:
         index = np.array([target.specular_index for target in scene.targets]) / scene.medium.phase_index
         facets = index[mesh.target]
     emitted, matrix = _emitted_stokes(scene.laser), scattering_matrix(scene.medium)
-    light = sk.make_polarisation(laser=emitted, matrix=matrix, channels=rows, facet_index=facets, device=device)
-    if not rows:
-        return {"polarisation": light}
-    tallies = sk.make_derivatives([], [], [scale] * len(rows), channels=len(rows), device=device)
-    return {"polarisation": light, "derivatives": tallies}
+    return sk.make_polarisation(laser=emitted, matrix=matrix, channels=rows, facet_index=facets, device=device)
 
 
-def _lines(scene: Scene, scale: float, device: wp.Device) -> dict[str, Any]:
-    """Light of other wavelengths, and a tally of each. That of inelastic scattering is finer than the histogram by as
-    much as it holds less: at most as much as inelastic scattering is of elastic by any one angle."""
+def _lines(scene: Scene, scale: float, device: wp.Device) -> tuple[Any, list[float]]:
+    """Light of other wavelengths, and the scale of each tally. Of inelastic scattering it is finer than the histogram's
+    by as much as it holds less: at most as much as inelastic scattering is of elastic by any one angle."""
     water, wavelength = scene.medium, scene.laser.wavelength_nm
     if count := len(water.beside):
         # Of their molecules what their scattering by the medium's law has not; the law of both is that of the medium.
@@ -548,8 +549,7 @@ def _lines(scene: Scene, scale: float, device: wp.Device) -> dict[str, Any]:
             device=device,
             delay=[one.group_index / water.group_index for one in water.beside],
         )
-        tallies = sk.make_derivatives([], [], [scale] * count, channels=count, device=device)
-        return {"lines": found, "derivatives": tallies}
+        return found, [scale] * count
     lines, least = water.inelastic, float(phase_function(water).density(np.linspace(0.01, math.pi, 500)).min())
     rows = np.array([one.in_waters(water.waters, wavelength) for one in lines])  # [line, water, coefficient]
     source, extinction, scattering = np.moveaxis(rows, (0, 1, 2), (2, 1, 0))
@@ -559,8 +559,7 @@ def _lines(scene: Scene, scale: float, device: wp.Device) -> dict[str, Any]:
         source, [one.anisotropy for one in lines], extinction, scattering, passed, media=media, device=device
     )
     parts = passed * (source / [[one.scattering] for one in water.waters]).max(axis=0) / (4.0 * math.pi * least)
-    scales = [scale / 2.0 ** math.floor(math.log2(max(part, 1e-12))) for part in parts]
-    return {"lines": found, "derivatives": sk.make_derivatives([], [], scales, channels=len(lines), device=device)}
+    return found, [scale / 2.0 ** math.floor(math.log2(max(part, 1e-12))) for part in parts]
 
 
 def _emitted_stokes(laser: Laser) -> tuple[float, float, float, float]:
@@ -627,14 +626,6 @@ def _check_places(scene: Scene, mesh: TriangleMesh | None, camera: bool = True) 
                 raise ConfigError(f"{section}.{field}: {text}", source=scene.source)
 
 
-def _check_gate(scene: Scene) -> None:
-    """Refuses a gate that begins after the longest path."""
-    begin, max_path = scene.gate.start * scene.medium.pulse_speed, scene.transport.max_path
-    if max_path is not None and max_path <= begin:
-        text = f"transport.max_path = {max_path} m is outside ({begin:g}, inf) m, the path at which the gate begins"
-        raise ConfigError(text, source=scene.source)
-
-
 def _check_size(scene: Scene, model: sk.Model, copies: float, signed: int) -> bool:
     """Refuses what cannot fit before anything is computed; returns whether half as much again would, which is more than
     the low words of the histograms take."""
@@ -671,56 +662,46 @@ def truth_maps(scene: SceneLike, *, device: str | None = None) -> Truth:
 
 def trace_truth(scene: Scene, model: sk.Model) -> Truth:
     """`truth_maps` for a model that is already on its device."""
-    camera = scene.camera
-    shape = (camera.height, camera.width)
+    shape = (scene.camera.height, scene.camera.width)
     if model.mesh is None:
         nothing = np.full(shape, np.nan, np.float32)
         return Truth(depth=nothing, range=nothing, normal=np.full((*shape, 3), np.nan, np.float32), reflectance=nothing)
-    if scene.surface is not None:
-        return _truth_by_sea(scene, model, shape)
-    if scene.scan.mode == "trajectory":  # in the frame of each pixel's shot
-        shots = _shots(scene)
-        _, ranges, normal, reflectance = trace_rays(model, *shots.lines(), shape)
-        normal = np.einsum("hwij,hwi->hwj", shots.rotation[shots.number], normal).astype(np.float32)
-        depth = (ranges * view_directions(scene)[..., 2]).astype(np.float32)
-        return Truth(depth=depth, range=ranges, normal=normal, reflectance=reflectance)
-    nowhere, lead = np.zeros((0, 0, 3)), 0.0  # type: tuple[Any, Any]
-    origins, directions = nowhere, nowhere if camera.is_plain else pixel_directions(camera)
-    if camera.port is not None:
-        lines = lines_of_sight(scene)
-        origins, directions, lead = lines.start, lines.direction, lines.lead
-    depth, ranges, normal, reflectance = trace_rays(model, origins, directions, shape)
-    return Truth(depth=depth, range=(ranges + lead).astype(np.float32), normal=normal, reflectance=reflectance)
+    shots = _shots(scene) if scene.scan.mode == "trajectory" else None
 
-
-def _truth_by_sea(scene: Scene, model: sk.Model, shape: tuple[int, int]) -> Truth:
-    """Of what stands before the surface of the sea, and of what is seen through its waves, or its mean plane."""
-    (origin, view), (start, direction, lead) = _rays_by_sea(scene, model)
-    near, far = (trace_rays(model, *rays, shape) for rays in ((origin, view), (start, direction)))
-    if scene.scan.mode == "trajectory":  # in the frame of each pixel's shot
-        shots = _shots(scene)
-        turns, from_lens = shots.rotation[shots.number], start - origin
-        for found, begin, along in ((near, np.zeros(3), view), (far, from_lens, direction)):
-            depth = np.einsum("hwi,hwi->hw", turns[..., 2], begin + found[1][..., None] * along)
+    def trace(begin: Any, along: Any, from_lens: Any) -> list[Any]:
+        found = trace_rays(model, begin, along, shape)
+        if shots is not None:  # in the frame of each pixel's shot
+            turns = shots.rotation[shots.number]
+            depth = np.einsum("hwi,hwi->hw", turns[..., 2], from_lens + found[1][..., None] * along)
             normal = np.einsum("hwij,hwi->hwj", turns, found[2])
             found[0], found[2] = depth.astype(np.float32), normal.astype(np.float32)
-    far[1] = (far[1] + lead).astype(np.float32)
-    before = near[1] < np.nan_to_num(lead, nan=np.inf)
-    values = [np.where(before[..., None] if a.ndim == 3 else before, a, b) for a, b in zip(near, far, strict=True)]
+        return found
+
+    (origin, view), (start, direction, lead) = _rays(scene, model)
+    values = trace(start, direction, start - origin)
+    values[1] = (values[1] + lead).astype(np.float32)
+    if scene.surface is not None:  # what stands before the surface hides what is seen through it
+        near = trace(origin, view, np.zeros(3))
+        before = near[1] < np.nan_to_num(lead, nan=np.inf)
+        pairs = zip(near, values, strict=True)
+        values = [np.where(before[..., None] if a.ndim == 3 else before, a, b) for a, b in pairs]
     return Truth(**dict(zip(("depth", "range", "normal", "reflectance"), values, strict=True)))
 
 
-def _rays_by_sea(scene: Scene, model: sk.Model) -> tuple[tuple[Any, Any], tuple[Any, Any, Any]]:
-    """Rays of pixels `[H, W, 3]`: begin and direction at the lens; and where they meet the surface of the sea, how they
-    go on, and their lengths up to there."""
+def _rays(scene: Scene, model: sk.Model) -> tuple[tuple[Any, Any], tuple[Any, Any, Any]]:
+    """Rays of pixels `[H, W, 3]`: begin and direction at the lens; and where they leave its port, or meet the surface
+    of the sea, how they go on, and their lengths up to there. Empty: the camera's own, as `trace_rays` takes them."""
+    camera, plane = scene.camera, camera_port(scene)
     if scene.scan.mode == "trajectory":
         origin, view = _shots(scene).lines()
+    elif camera.is_plain and plane is None and scene.surface is None:
+        origin = view = np.zeros((0, 0, 3))
     else:
-        view = pixel_directions(scene.camera)
+        view = pixel_directions(camera)
         origin = np.zeros(view.shape)
     if scene.surface is None or scene.surface.waves is None:
-        plane = camera_port(scene) or mean_plane(scene, from_below=True)
-        return (origin, view), plane.enter(origin, view)[:3]
+        plane = mean_plane(scene, from_below=True) if plane is None and scene.surface is not None else plane
+        return (origin, view), (origin, view, 0.0) if plane is None else plane.enter(origin, view)[:3]
     rays: Any = [wp.array(a.astype(np.float32), dtype=wp.vec3, device=model.device) for a in (origin, view)]
     found: Any = [wp.empty_like(rays[0]), wp.empty_like(rays[0]), wp.empty(rays[0].shape, float, device=model.device)]
     wp.launch(sk.see_through_waves_kernel, rays[0].shape, [model.sea, *rays], found, device=model.device)
@@ -743,7 +724,7 @@ def wave_errors(scene: SceneLike, depth: ArrayLike | None = None, *, device: str
     if scene.surface is None or scene.surface.waves is None or plane is None:
         raise ConfigError("surface.waves, and a camera in the air above them, are needed", source=scene.source)
     model = build_model(scene, pick_device(device), build_mesh(scene), camera=False)
-    (origin, _), (start, direction, lead) = _rays_by_sea(scene, model)
+    (origin, _), (start, direction, lead) = _rays(scene, model)
     in_air = lead * plane.group_index[0] / plane.group_index[2]  # as a length in water
     lines = dataclasses.replace(lines_of_sight(scene), laser=np.zeros(3), laser_port=plane)
     if depth is None:

@@ -16,8 +16,8 @@ import spadwarp_kernels as sk
 from spadwarp.mesh import TriangleMesh, build_mesh, focus_distance
 from spadwarp.result import Result, ResultLike
 from spadwarp.result.file import difference
+from spadwarp.result.photon_ids import count, shard_of
 from spadwarp.result.result import ResultHead
-from spadwarp.result.tallies import count, shard_of
 from spadwarp.scene import Laser, Scene, Transport
 from spadwarp.scene.camera import to_camera
 from spadwarp.scene.laser import load_profile, profile_extent
@@ -135,8 +135,6 @@ def make_plan(
     first_photon, shard, batch_size = run.first_photon, run.shard, 0
     if relative_error is not None:
         check_real("relative_error", relative_error, "(0, 1)")
-        if shard is not None:
-            raise ConfigError("relative_error cannot be combined with shard: no part knows the error of the whole")
     names = () if derivatives is None else resolve_derivatives(scene, derivatives, blocks)
     if resume is not None:
         _check_resumed(resume, run, seed)
@@ -156,8 +154,9 @@ def make_plan(
     photons = most if photons == "auto" else photons
     if resume is not None and photons <= resume.photons:
         raise ConfigError(f"photons = {photons} is outside [{resume.photons + 1}, {10**12}]")
-    if is_auto and shard is not None:
-        raise ConfigError("photons = 'auto' cannot be combined with shard: no part knows the error of the whole")
+    if shard is not None and (is_auto or relative_error is not None):
+        goal = "photons = 'auto'" if is_auto else "relative_error"
+        raise ConfigError(f"{goal} cannot be combined with shard: no part knows the error of the whole")
     if batches:
         wanted = _batch_size(scene, None if is_auto else photons, relative_error, shard, kind)
         batch_size = max(0 if resume is None else resume.batch_size, wanted)

@@ -23,8 +23,9 @@ from spadwarp.device import pick_device, pick_devices, processor_name
 from spadwarp.parallel.workers import Event, Ray, interruptible
 from spadwarp.result import Result, as_result, merge, save_result
 from spadwarp.result.file import TARGETS_DIFFER, same_targets
+from spadwarp.result.photon_ids import IdQueue, Range, Ranges, count, joined, without
 from spadwarp.result.result import NOISE_GOAL, ResultHead, largest_share, unseen_warnings
-from spadwarp.result.tallies import IdQueue, Range, Ranges, check_capacity, count, joined, without
+from spadwarp.result.tallies import check_capacity
 from spadwarp.scene import SceneLike, as_scene
 from spadwarp.transport.model import points_per_flight
 from spadwarp.transport.plan import Plan, RunOptions, make_plan
@@ -278,20 +279,18 @@ class _Run:
     def _trace(self, span: Range, deadline: float = math.inf) -> None:
         """Traces the ids of a span that are not done; fewer where the run is stopped, or the time is over."""
         self._waiting = IdQueue(without(span, joined([*self._earlier, *self._done])))
-        stop_sent = False
         try:
             while True:
-                if self._stopped.is_set() and not stop_sent:
+                if stopped := self._stopped.is_set():
                     self._workers.stop()
-                    stop_sent = True
                 if time.monotonic() >= deadline and (self._done or self._held or self._running):
                     self._waiting = IdQueue(())
-                ending = stop_sent or not self._unfinished()
+                ending = stopped or not self._unfinished()
                 pause = math.inf if self._place is None else max(self._every, self._cost / _LARGEST_SHARE)
                 if self._collecting is None and not ending and time.monotonic() >= self._written + pause:
                     # None again if no worker has done or begun anything yet.
                     self._collecting = {*self._held, *self._running} or None
-                self._assign(ending, stop_sent, deadline)
+                self._assign(ending, stopped, deadline)
                 if ending and not self._running:
                     return
                 for event in self._workers.wait():

@@ -70,18 +70,21 @@ class Spectrum:
         if {line.wavelength_nm for line in lines} != set(self.results):
             text = f"{len(self.results)} wavelengths are not the {len(lines)} lines of the spectrum"
             raise ConfigError(f"laser.spectrum: {text}; wavelengths = 'spectrum' takes those")
-        shares = self.shares
-        whole, first = math.fsum(shares.values()), next(iter(self.results.values()))
-        light = np.zeros(first.tallies.shape)
-        for wavelength, one in self.results.items():
-            # A bin is as long at all wavelengths; what a tally unit stands for may differ from line to line.
-            light += shares[wavelength] / max(whole, 1e-300) * (one.unit * one.photons) * one.tallies
-        unit = min(one.unit for one in self.results.values())
-        tallies: NDArray[np.int64] = np.rint(light / (unit * first.photons)).astype(np.int64)
-        none: dict[str, Any] = dict.fromkeys(("half", "second_moment", "reconstruction", "derivative_tallies"))
-        return replace(
-            first, scene=self.scene, tallies=tallies, unit=unit, batches=0, batch_size=0, batch_moments={}, **none
-        )
+        shares, runs, summed = self.shares, [*self.results.values()], list[tuple[NDArray[np.int64], float]]()
+        whole, first, signed = math.fsum(shares.values()), runs[0], runs[0].signed_tallies
+        # Of each histogram, channel or derivative the lines. A bin is as long at all wavelengths; what a tally unit
+        # stands for may differ from line to line.
+        for cubes in zip(*map(_tallies_and_units, runs), strict=True):
+            light, unit = np.zeros(first.tallies.shape), min(own for _, own in cubes)
+            for (wavelength, one), (tallies, own) in zip(self.results.items(), cubes, strict=True):
+                light += shares[wavelength] / max(whole, 1e-300) * (own * one.photons) * tallies
+            summed.append((np.rint(light / (unit * first.photons)).astype(np.int64), unit))
+        histograms, units = zip(*summed, strict=True)
+        if signed is not None:
+            signed = replace(signed, tallies=np.stack(histograms[1:]), units=units[1:], second_moment=None)
+        none: dict[str, Any] = dict.fromkeys(("half", "second_moment", "reconstruction"))
+        new: dict[str, Any] = {"tallies": histograms[0], "unit": units[0], "signed_tallies": signed}
+        return replace(first, scene=self.scene, **new, batches=0, batch_size=0, batch_moments={}, **none)
 
     def to_xarray(self) -> xarray.Dataset:
         """`Result.to_xarray` of all lines along `wavelength` [nm]; the path of a bin differs with the group index.
@@ -122,6 +125,12 @@ class Spectrum:
         import spadwarp
 
         return spadwarp.viz.draw_spectrum(self, path, depth=depth)
+
+
+def _tallies_and_units(result: Result) -> list[tuple[NDArray[np.int64], float]]:
+    signed = result.signed_tallies
+    others = () if signed is None else zip(signed.tallies, signed.units, strict=True)
+    return [(result.tallies, result.unit), *others]
 
 
 def simulate_spectrum(
@@ -214,7 +223,7 @@ def _simulate_together(lines: Sequence[Scene], **options: Any) -> list[Result]:
     cubes, kept = cubes_of(run, "channels"), slice(before, before + gate.bins)
     found = [*cubes.values()]
     found.insert(middle, Cube(run.tallies, run.unit, run.second_moment))
-    none: dict[str, Any] = dict.fromkeys(("half", "channel_tallies"))
+    none: dict[str, Any] = dict.fromkeys(("half", "signed_tallies"))
     return [
         replace(
             run,

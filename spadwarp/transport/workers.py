@@ -11,7 +11,9 @@ import time
 import weakref
 from collections import deque
 from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager, suppress
+from concurrent.futures import FIRST_COMPLETED, Future, ThreadPoolExecutor, wait
+from contextlib import contextmanager
+from dataclasses import replace
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -24,19 +26,8 @@ from spadwarp.device import core_count, kernel_thread, pick_device, pick_devices
 from spadwarp.mesh import TriangleMesh
 from spadwarp.parallel.workers import Event, Ray, RayWorkers, Worker
 from spadwarp.result import FluxTallies, SignedTallies, Tallies, Truth
-from spadwarp.result.tallies import (
-    OVERFLOW,
-    IdQueue,
-    Range,
-    Ranges,
-    added,
-    count,
-    joined,
-    joined_moments,
-    moments_of,
-    photons_per_position,
-    total_of,
-)
+from spadwarp.result.photon_ids import IdQueue, Range, Ranges, count, joined, photons_per_position
+from spadwarp.result.tallies import OVERFLOW, joined_moments, moments_of, total_of
 from spadwarp.scene import Scene
 from spadwarp.transport.model import MeshCache, build_model, trace_truth, transport_spec
 from spadwarp.transport.plan import LARGEST_LAUNCH, LAUNCH_SIZE, Plan, RunOptions, make_plan
@@ -55,7 +46,7 @@ class _Histogram:
     """A tally on the device, `[voxel * parts]`, and its batches, if any; `total` may be the caller's."""
 
     def __init__(
-        self, array: wp.array, components: int, *, signed: bool, batched: bool, total: wp.array | None = None
+        self, array: wp.array, components: int, *, batched: bool, signed: bool = False, total: wp.array | None = None
     ) -> None:
         self.array, self._signed = array, signed
         halved = not signed and components > 1
@@ -92,16 +83,6 @@ class _Histogram:
         return words
 
 
-class _Closed(NamedTuple):
-    """What closed batches left beside their arrays, as in `Tallies`."""
-
-    energy_balance: dict[str, int]
-    counters: dict[str, int]
-    batch_moments: dict[str, int]
-    batches: int
-    half_photons: int
-
-
 class DeviceWorker:
     """A device with a model and tallies of its own, or the caller's.
 
@@ -127,20 +108,18 @@ class DeviceWorker:
         total = None if tallies is None else caller_tallies(tallies, shape=self._shape, device=model.device)
         self.model, self._spec, self._seed, self._signed = model, spec, seed, signed
         self._threads, self._launch_size, self._batch_size = threads, launch_size, batch_size
-        batched = batch_size > 0
+        components, batched = len(self._names), batch_size > 0
         with device_errors(model.device):
             own = None if batched else total
             self.data = sk.make_data(model, tally=own, histogram=not spec.records, derivatives=len(signed))
-            components = len(self._names)
-            self._histograms = [_Histogram(self.data.tally, components, signed=False, batched=batched, total=total)]
+            self._histograms = [_Histogram(self.data.tally, components, batched=batched, total=total)]
             if self.data.gradients is not None:
-                self._histograms.append(_Histogram(self.data.gradients, components, signed=True, batched=batched))
+                self._histograms.append(_Histogram(self.data.gradients, components, batched=batched, signed=True))
             if self.data.flux is not None:
-                self._histograms.append(_Histogram(self.data.flux, 1, signed=False, batched=batched))
+                self._histograms.append(_Histogram(self.data.flux, 1, batched=batched))
             # Compiles, or loads from Warp's cache, before the time of the launches is taken.
-            self._most = min(launch_size, batch_size or launch_size)
             sk.load_transport_kernel(spec, model.device)
-        self._closed = list[_Closed]()
+        self._closed = list[Tallies]()  # what closed batches left beside their arrays
         self._unread = list[tuple[int, bool]]()  # batches closed on the device: photons, and whether in the half
         self._running = deque[tuple[int, wp.Event]]()  # launches on a GPU: photons, and their end
 
@@ -158,13 +137,28 @@ class DeviceWorker:
 
         `report` gets the photons of each launch, from the thread that ran it.
         """
-        done, size = list[Range](), self._batch_size or block[1]
+        done, size, device = list[Range](), self._batch_size or block[1], self.model.device
         edges = [block[0], *range((block[0] // size + 1) * size, block[1], size), block[1]]
-        with device_errors(self.model.device):
-            most = min(self._most, block[1] - block[0])
+        most = min(self._launch_size, size, block[1] - block[0])
+
+        def run(span: Range) -> Ranges:
+            first, stop = span
+            if stopped.is_set():
+                return ()
+            launch(first, stop - first)
+            if device.is_cuda:  # where it may still be under way
+                self._running.append((stop - first, device.stream.record_event()))
+                self._wait(report, ahead=1)
+            else:
+                report(stop - first)
+            return (span,)
+
+        # What fails cancels what has not begun.
+        with device_errors(device), ThreadPoolExecutor(self._threads) as pool:
             launch = sk.prepare_transport(self._spec, self.model, self.data, seed=self._seed, photon_count=most)
+            run_all = pool.map if self._threads > 1 else map
             for part in itertools.pairwise(edges):
-                traced = self._trace(part, launch, stopped, report)
+                traced = joined(itertools.chain(*run_all(run, self._spans(part))))
                 if self._batch_size and traced:
                     self._close_batch(traced)
                 done += traced
@@ -175,52 +169,16 @@ class DeviceWorker:
             self._check_overflow()
         return joined(done)
 
+    def _spans(self, ids: Range) -> Iterator[Range]:
+        """Of launches: shorter ones towards the end so that all threads end at about the same time."""
+        waiting, parts = IdQueue([ids]), 2 * self._threads if self._threads > 1 else 1
+        while span := waiting.take(min(self._launch_size, max(waiting.left // parts, self._launch_size // 16, 1))):
+            yield span
+
     def _check_overflow(self) -> None:
         """After every block of photons, long before an integer could wrap around and look right again."""
         if any(histogram.has_overflowed() for histogram in self._histograms):
             raise SpadwarpError(OVERFLOW)
-
-    def _trace(
-        self, ids: Range, launch: Callable[[int, int], None], stopped: threading.Event, report: Callable[[int], None]
-    ) -> Ranges:
-        """Traces the ids with all threads; on a GPU the last launch may still be under way."""
-        waiting, done, lock = IdQueue([ids]), list[Range](), threading.Lock()
-        failures: list[BaseException] = []
-        device: Any = self.model.device
-
-        def spans() -> Iterator[Range]:
-            while not (stopped.is_set() or failures):
-                with lock:
-                    # Fewer towards the end so that all threads end at about the same time.
-                    share = waiting.left // (2 * self._threads) if self._threads > 1 else waiting.left
-                    span = waiting.take(min(self._launch_size, max(share, self._launch_size // 16, 1)))
-                if span is None:
-                    return
-                yield span
-
-        def work() -> None:
-            try:
-                for first, stop in spans():
-                    launch(first, stop - first)
-                    with lock:
-                        done.append((first, stop))
-                    if device.is_cuda:
-                        self._running.append((stop - first, device.stream.record_event()))
-                        self._wait(report, ahead=1)
-                    else:
-                        report(stop - first)
-            except BaseException as error:
-                failures.append(error)
-
-        helpers = [threading.Thread(target=work, daemon=True) for _ in range(self._threads - 1)]
-        for thread in helpers:
-            thread.start()
-        work()
-        for thread in helpers:
-            thread.join()
-        if failures:
-            raise failures[0]
-        return joined(done)
 
     def _close_batch(self, ids: Ranges) -> None:
         """Adds a batch of these photons to the totals."""
@@ -241,9 +199,15 @@ class DeviceWorker:
         unread, sums = self._unread, self._histograms[0].batches.take_sums()
         each = [moments_of(self._names, s, n, self._batch_size) for s, (n, _) in zip(sums, unread, strict=True)]
         half = sum(photons for photons, in_half in unread if in_half)
-        self._closed.append(_Closed(*sk.read_ledger(self.data), joined_moments(*each), len(unread), half))
+        read = self._counted(batches=len(unread), half_photons=half, batch_moments=joined_moments(*each))
+        self._closed.append(read)
         self.data.ledger.zero_()
         self._unread = []
+
+    def _counted(self, **of_batches: Any) -> Tallies:
+        """What stands in the ledger; without arrays."""
+        balance, counters = sk.read_ledger(self.data)
+        return Tallies(tallies=np.zeros(0, np.int64), energy_balance=balance, counters=counters, **of_batches)
 
     def take_over(self, other: DeviceWorker) -> None:
         """Moves the tallies of another worker of the same run here; both must rest."""
@@ -258,24 +222,18 @@ class DeviceWorker:
     def tallies(self) -> Tallies:
         """Those of all photons traced here, open batches aside; on the CPU in the memory of this worker."""
         with device_errors(self.model.device):
-            closed = self._closed or [_Closed(*sk.read_ledger(self.data), {}, batches=0, half_photons=0)]
-            balances, counters, moments, batches, halves = zip(*closed, strict=True)
-            balance = added(*balances)
-            signed, histogram, last = self._signed_tallies(), self._histograms[0], self._histograms[-1]
+            counted = total_of(*(self._closed or [self._counted()]))
+            balance, histogram, last = dict(counted.energy_balance), self._histograms[0], self._histograms[-1]
             flux = None if self.data.flux is None else last.total
             if self._spec.lines and not (self._spec.layered or self.model.lines.elastic[0]):
                 balance = self._with_shifted(balance)
-            return Tallies(
+            return replace(
+                counted,
                 tallies=_on_host(histogram.total).reshape(self._shape),
                 energy_balance=balance,
-                counters=added(*counters),
-                batch_moments=joined_moments(*moments),
-                batches=sum(batches),
-                half_photons=sum(halves),
                 half=None if histogram.half is None else _on_host(histogram.half).reshape(self._shape),
                 second_moment=histogram.second_moment(self._shape[1:]),
-                derivative_tallies=None if self._spec.channels else signed,
-                channel_tallies=signed if self._spec.channels else None,
+                signed_tallies=self._signed_tallies(),
                 flux_tallies=None if flux is None else FluxTallies(_on_host(flux), last.second_moment(flux.shape)),
             )
 
@@ -286,7 +244,8 @@ class DeviceWorker:
         histogram, shape = self._histograms[1], (*self._shape, len(self._signed))
         values, moments = histogram.total.numpy().reshape(shape), histogram.second_moment(shape[1:])
         moments = None if moments is None else np.ascontiguousarray(np.moveaxis(moments, -1, 1))
-        return SignedTallies(self._signed, np.moveaxis(values, -1, 0), self.signed_units, moments)
+        group: Any = "channels" if self._spec.channels else "derivatives"
+        return SignedTallies(group, self._signed, np.moveaxis(values, -1, 0), self.signed_units, moments)
 
     def _with_shifted(self, energy_balance: dict[str, int]) -> dict[str, int]:
         """Of what the water has absorbed, the part that is scattered inelastically in entries of its own: at every
@@ -449,56 +408,40 @@ class LocalWorkers:
         self.timing = {"setup": built - began, "compile": time.perf_counter() - traced, "truth": traced - built}
         self.first_block = threads * size
         self._devices, self._stopped = devices, threading.Event()
-        self._events: queue.SimpleQueue[Event] = queue.SimpleQueue()
-        self._busy, self._failures = set[Worker](), list[BaseException]()
-        self.workers = [
-            Worker(device.alias, threads, self._stopped, {"tracer": tracer})
-            for device, tracer in zip(devices, self.tracers, strict=True)
-        ]
-        for worker in self.workers:
-            worker.state["report"] = functools.partial(self._report, worker)
-
-    def _report(self, worker: Worker, photons: int) -> None:
-        self._events.put(Event("progress", worker, photons))
+        self._pool, self._pending = ThreadPoolExecutor(len(devices)), dict[Future[Any], Worker]()
+        self._reported: queue.SimpleQueue[Event] = queue.SimpleQueue()
+        self.workers = [Worker(device.alias, threads, self._stopped) for device in devices]
+        for worker, tracer in zip(self.workers, self.tracers, strict=True):
+            worker.state |= {
+                "tracer": tracer,
+                "report": lambda n, who=worker: self._reported.put(Event("progress", who, n)),
+            }
 
     @property
     def idle(self) -> list[Worker]:
-        return [] if self._failures else [worker for worker in self.workers if worker not in self._busy]
+        busy = self._pending.values()
+        return [worker for worker in self.workers if worker not in busy]
 
     def send(self, worker: Worker, work: Callable[..., Any], *arguments: Any) -> None:
         """Lets an idle worker run `work(*arguments, worker)`."""
-
-        def run() -> None:
-            try:
-                self._events.put(Event("returned", worker, work(*arguments, worker)))
-            except BaseException as error:
-                self._stopped.set()
-                self._events.put(Event("failed", worker, error))
-
-        self._busy.add(worker)
-        threading.Thread(target=run, daemon=True).start()
+        self._pending[self._pool.submit(work, *arguments, worker)] = worker
 
     def collect(self, worker: Worker) -> None:
         """Tallies stay where they are: `tallies` adds them up when all workers rest."""
-        self._busy.add(worker)
-        self._events.put(Event("returned", worker))
+        self.send(worker, lambda worker: None)
 
     def stop(self) -> None:
         self._stopped.set()
 
     def wait(self) -> list[Event]:
         """As `RayWorkers.wait`, and "progress": more photons of a worker's block are done."""
-        events: list[Event] = []
-        with suppress(queue.Empty):
-            # With a timeout: Python handles a signal only when the wait for a lock ends.
-            events.append(self._events.get(timeout=0.1))
-            while True:
-                events.append(self._events.get_nowait())
-        self._busy -= {event.worker for event in events if event.kind != "progress"}
-        self._failures += [event.value for event in events if event.kind == "failed"]
-        if self._failures and not self._busy:
-            raise self._failures[0]
-        return [event for event in events if event.kind != "failed"]
+        # With a timeout: Python handles a signal only when the wait for a lock ends.
+        done = wait(self._pending, timeout=0.1, return_when=FIRST_COMPLETED).done
+        if any(future.exception() for future in done):
+            self.stop()
+            wait(self._pending)  # until all rest
+        events = [self._reported.get() for _ in range(self._reported.qsize())]
+        return events + [Event("returned", self._pending.pop(future), future.result()) for future in done]
 
     def tallies(self) -> Tallies:
         """Those of all devices, added up on the first; on CPUs in its own memory."""

@@ -46,7 +46,7 @@ def of_seeds(one, device, photons, seeds, derivatives=(), blocks=None):
         found = worker.tallies()
         assert sum(found.energy_balance.values()) * sk.LEDGER_UNIT == photons
         assert found.counters["invalid"] == 0 and found.counters["clipped"] == 0
-        values = found.derivative_tallies or found.channel_tallies
+        values = found.signed_tallies
         if values is not None:
             units = np.array(values.units).reshape(-1, 1, 1, 1, 1)
             values = values.tallies * (units / photons)

@@ -150,10 +150,9 @@ def test_derivatives_and_channels_survive_files_merging_and_resuming(kind, tmp_p
     short = simulate(one, **{**options, "photons": 4096})
     resumed = [simulate(one, photons=8192, device="cpu", run=RunOptions(resume=part)) for part in (halves[0], short)]
     loaded = spadwarp.load(whole.save(tmp_path / "result.h5"))
-    signed = "channel_tallies" if kind == "channels" else "derivative_tallies"
     for other in (loaded, merge(halves), *resumed):
-        found, expected = getattr(other, signed), getattr(whole, signed)
-        assert (found.names, found.units) == (expected.names, expected.units)
+        found, expected = other.signed_tallies, whole.signed_tallies
+        assert (found.group, found.names, found.units) == (expected.group, expected.names, expected.units)
         np.testing.assert_array_equal(found.tallies, expected.tallies)
     for name in ("derivatives", "channels", "derivative_errors", "channel_errors"):
         for key, values in getattr(whole, name).items():
