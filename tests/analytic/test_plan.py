@@ -156,12 +156,10 @@ def test_more_error_takes_fewer_pulses_and_the_floor_cannot_be_passed(found):
 def test_coarse_bins_are_the_limit_of_coarse_bins_wherever_they_begin():
     """At three places of a plate square to the axis within a bin, which covers 110 mm."""
     scene = make(medium={"extinction": 0.05, "albedo": 0.2}, gate={"bin_width_ps": 1000.0})
-    floors = []
-    for distance in (6.0, 6.03, 6.06):
-        place = {"targets[0].translation": [0.0, 0.0, distance], "targets[0].rotation_deg": [0.0, 0.0, 0.0]}
-        coarse = proposal(scene.with_overrides(place))
-        assert coarse.limit == "bin width" and "bin_width_ps" in coarse.advice and not coarse.reached
-        floors.append(coarse.pilot.floor["likelihood"])
+    plates = ({"translation": [0.0, 0.0, z], "rotation_deg": [0.0, 0.0, 0.0]} for z in (6.0, 6.03, 6.06))
+    found = [proposal(scene.with_overrides({"targets[0]": plate})) for plate in plates]
+    assert all(one.limit == "bin width" and "bin_width_ps" in one.advice and not one.reached for one in found)
+    floors = [one.pilot.floor["likelihood"] for one in found]
     assert max(floors) < 1.2 * min(floors)
 
 

@@ -58,7 +58,7 @@ def test_order_statistics_are_those_of_a_sort():
 
 
 def test_muon_moves_all_directions_alike_and_as_far_as_adamw():
-    """Of a gradient whose singular values differ by a thousand; AdamW's steps have a mean square of about 0.2² rates."""
+    """Of a gradient whose singular values differ by a thousand; AdamW's have a root mean square of about 0.2 rates."""
     generator = torch.Generator().manual_seed(7)
     for shape in ((48, 16), (16, 9, 3, 3)):
         rows, columns = torch.zeros(shape).flatten(1).shape
