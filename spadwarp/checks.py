@@ -59,7 +59,6 @@ class CheckMessage:
 class OnAxis:
     """Unscattered light on the beam's axis at the range of the nearest illuminated point."""
 
-    distance: float  # that range [m]
     optical_depth: float  # to it, one way
     irradiance: float  # mean over time [W/m²]
     samples_per_pixel: float  # traced photons that reach one pixel's part of the target
@@ -86,6 +85,8 @@ class Survey:
         self.reflectance = 0.0 if mesh is None else float(mesh.reflectance.max(initial=0.0))
         self.focus_distance = focus_distance(scene, mesh)  # [m]; None for a pinhole
         self.camera_port, self.laser_port = camera_port(scene), laser_port(scene)
+        port, axis = self.laser_port, (np.array(laser.position), np.array(laser.axis))
+        self.beam_axis = axis if port is None else port.enter(*axis)[:2]  # from where it enters the water, and its way
         self.view = view_planes(scene.camera)
         # A scan brings its beam to all that is in view.
         self.beam = beam_planes(laser) if scene.scan_positions == 1 else np.zeros((0, 4))
@@ -98,21 +99,21 @@ class Survey:
         self.bin_range = range_from_time(scene.gate.bin_width, scene.medium.group_index)
         self.irf_fwhm_ps = math.hypot(scene.laser.pulse_fwhm_ps, scene.detector.jitter_fwhm_ps)
         # Nearest and farthest point from the lens that is in view and beam [m], first and last unscattered return from
-        # them [ns], optical depth and light of the nearest; None if there are none, or it lies at the lens centre.
-        self.target_range = self.target_arrival_ns = self.optical_depth = self.on_axis = None
+        # them [ns], light of the nearest; None if there are none, or it lies at the lens centre.
+        self.target_range = self.target_arrival_ns = self.on_axis = None
+        self.distance = self.range_of(scene.gate.stop)  # of the nearest; where there is none, of the gate's end [m]
         if found := within_port(scene, triangles):
             self.warn(*found)
         if len(illuminated := self.illuminated_part(triangles)):
             illuminated = self.visible(illuminated)
             ranges, paths = self._ways(illuminated, self._sides[:1], 2), self.paths(illuminated)
-            self.target_range = float(ranges.min()), float(ranges.max())
+            self.distance, _ = self.target_range = float(ranges.min()), float(ranges.max())
             self.target_arrival_ns = self.arrival_ns(float(paths.min())), self.arrival_ns(float(paths.max()))
             nearest, begin = illuminated[ranges.argmin()], np.zeros(3)
             if scene.surface is not None and self.camera_port is not None:  # from the air: of the way in the water
                 begin = self.camera_port.enter(begin, self.camera_port.connect(nearest, begin)[0])[0]
-            self.optical_depth = scene.optical_depth(begin, nearest)
-            if self.target_range[0] > 1e-5:
-                self.on_axis = self._on_axis(self.target_range[0], self.optical_depth)
+            if self.distance > 1e-5:
+                self.on_axis = self._on_axis(self.distance, scene.optical_depth(begin, nearest))
 
     def warn(self, field: str, text: str, **values: float) -> None:
         """Adds a warning."""
@@ -148,13 +149,13 @@ class Survey:
         return points[seen] if (seen := hit >= 0.999 * distance).any() else points
 
     def _rays(self) -> tuple[Points, Points]:
-        """Rays in the water over what the camera sees and the beam, which corners of triangles may all lie beside."""
+        """Rays in the water over what the camera sees, and the beam's axis: a triangle's corners may lie beside."""
         scene, steps = self.scene, np.linspace(0.001, 0.999, 25)
         left, top, right, bottom = scene.camera.view_box
         x, y = np.meshgrid(left + (right - left) * steps, top + (bottom - top) * steps)
         view = np.stack([x, y, np.ones_like(x)], axis=-1).reshape(-1, 3)
         seen = lines_of_sight(scene, view / np.linalg.norm(view, axis=1, keepdims=True))
-        return seen.start, seen.direction
+        return np.vstack([seen.start, self.beam_axis[0]]), np.vstack([seen.direction, self.beam_axis[1]])
 
     def paths(self, points: Points) -> Points:
         """Paths [m] from the laser by points `[N, 3]` to the lens, as lengths in water."""
@@ -191,7 +192,6 @@ class Survey:
         collected = self.reflectance / math.pi * scene.camera.aperture_area / distance**2
         photons = ballistic * passed * through * collected * scene.laser.photons_per_pulse
         return OnAxis(
-            distance=distance,
             optical_depth=optical_depth,
             irradiance=axis_fluence(scene, distance) * passed * scene.laser.average_power,
             samples_per_pixel=_photons(scene) / scene.scan_positions * ballistic,
@@ -253,13 +253,10 @@ def summary(scene: SceneLike, mesh: TriangleMesh | None = None) -> dict[str, Any
     scene = as_scene(scene)
     survey = Survey(scene, mesh)
     camera, gate, laser, medium = scene.camera, scene.gate, scene.laser, scene.medium
-    axis = dict.fromkeys(field.name for field in dataclasses.fields(OnAxis))
-    axis |= {} if survey.on_axis is None else vars(survey.on_axis)
-    del axis["distance"]
+    axis = {field.name: getattr(survey.on_axis, field.name, None) for field in dataclasses.fields(OnAxis)}
     if axis["samples_per_pixel"] == math.inf:  # of as many photons as it takes
         axis["samples_per_pixel"] = None
-    names = "attenuation_length", "albedo"
-    waters = [dict(zip(names, (1.0 / w.extinction, w.scattering / w.extinction), strict=True)) for w in medium.waters]
+    waters = [{"attenuation_length": 1.0 / w.extinction, "albedo": w.scattering / w.extinction} for w in medium.waters]
     return {
         **waters[0],
         "layers": [{"start": layer.start, **water} for layer, water in zip(medium.layers, waters[1:], strict=True)],
@@ -267,7 +264,6 @@ def summary(scene: SceneLike, mesh: TriangleMesh | None = None) -> dict[str, Any
         "target_range": survey.target_range,
         "target_arrival_ns": survey.target_arrival_ns,
         **axis,
-        "optical_depth": survey.optical_depth,
         "gate_range": (survey.range_of(gate.start), survey.range_of(gate.stop)),
         "bin_range": survey.bin_range,
         "path_limit": scene.path_limit,
@@ -365,7 +361,7 @@ _AROUND = 2.0  # [ns] of a gate before and after a target
 
 
 def _check_targets(survey: Survey) -> None:
-    """The targets, and where camera and laser stand."""
+    """The targets, and whether camera and laser stand in the water."""
     scene = survey.scene
     if not scene.targets:
         survey.note("targets", "the scene has none: only the water scatters light back")
@@ -376,11 +372,17 @@ def _check_targets(survey: Survey) -> None:
         if target.specular > 0.0:
             text = f"specular = {target.specular:g} acts in `simulate` alone; all else takes the target as Lambertian"
             survey.note(f"targets[{index}].specular", text, specular=target.specular)
-    (low, high), laser = scene.domain.bounds, to_world(scene.camera, scene.beam.position)
-    for name, point in (("the lens", scene.camera.position), ("the laser", laser)):
-        if any(not (a <= x <= b) for a, x, b in zip(low, point, high, strict=True)):
-            text = f"{name} at {_vector(point)} m is outside the water, {_vector(low)} to {_vector(high)} m"
+    low, high = np.array(scene.domain.bounds)
+    for name, field, place, port in (
+        ("the lens", "camera.port", np.array(scene.camera.position), scene.camera.port),
+        ("the laser", "laser.port", to_world(scene.camera, scene.beam.position), scene.laser.port),
+    ):
+        if not ((low <= place) & (place <= high)).all():
+            text = f"{name} at {_vector(place)} m is outside the water, {_vector(low)} to {_vector(high)} m"
             survey.warn("domain", text)
+        elif isinstance(port, Port) and port.shape == "flat" and port.thickness == 0.0:
+            text = "without a window it is a calm surface, but no face of the domain ends the water there: domain"
+            survey.warn(field, text)
 
 
 def _vector(values: Any) -> str:
@@ -405,19 +407,18 @@ def _check_target(survey: Survey, name: str, triangles: Points) -> None:
         return survey.warn(name, text, half_width=wide, half_height=tall, depth=depth)
     if (nearest := float(np.linalg.norm(in_view, axis=1).min())) <= scene.camera.aperture_radius:
         return survey.warn(name, f"reaches the lens ({where}): translation moves it away", nearest=nearest)
+    angles = _angles(survey, survey.visible(in_view))
     if not len(illuminated):
-        angles = np.degrees(_angles(survey.visible(in_view), laser))
         text = (
             f"the beam misses what the camera sees of it: {where}, that is {angles.min():.3g} to {angles.max():.3g}° "
-            f"off the axis, {_beam_text(scene.laser)}"
         )
+        text += f"off the axis, {_beam_text(scene.laser)}"
         return survey.warn(name, text, nearest_angle_deg=float(angles.min()))
-    if laser.profile in ("uniform_cone", "gaussian") and scene.scan_positions == 1 and laser.half_angle_deg < 90.0:
-        widest = math.degrees(float(_angles(survey.visible(in_view), laser).max()))
-        if math.tan(math.radians(min(widest, 89.9))) > 2.0 * math.tan(laser.half_angle):
-            text = f"the beam misses most of what the camera sees of it: that reaches {widest:.3g}° off the axis, "
-            text += _beam_text(scene.laser)
-            survey.note("laser.half_angle_deg", text, widest_angle_deg=widest)
+    widest = float(angles.max())
+    cone = laser.profile in ("uniform_cone", "gaussian") and scene.scan_positions == 1 and laser.half_angle_deg < 90.0
+    if cone and math.tan(math.radians(min(widest, 89.9))) > 2.0 * math.tan(laser.half_angle):
+        text = f"the beam misses most of what the camera sees of it: that reaches {widest:.3g}° off the axis, "
+        survey.note("laser.half_angle_deg", text + _beam_text(scene.laser), widest_angle_deg=widest)
     illuminated = survey.visible(illuminated)
     _check_gate(survey, name, survey.paths(illuminated))
     side = float(np.abs(illuminated[:, :2]).max())
@@ -460,11 +461,11 @@ def _check_gate(survey: Survey, name: str, paths: Points) -> None:
         survey.warn("transport.max_path", text, max_path=limit, path=farthest)
 
 
-def _angles(points: Points, laser: Laser) -> Points:
-    """Angles [rad] of the points against the beam's axis, seen from the laser."""
-    away, axis = points - np.array(laser.position), np.array(laser.axis)
-    along = away @ axis
-    return np.arctan2(np.linalg.norm(away - along[:, None] * axis, axis=1), along)
+def _angles(survey: Survey, points: Points) -> Points:
+    """Angles [°] against the beam's axis at which light leaves the laser for the points, through its port."""
+    laser, port = survey.scene.beam, survey.laser_port
+    away = points - laser.position if port is None else port.connect(points, laser.position)[0]
+    return np.degrees(np.arctan2(np.linalg.norm(np.cross(away, laser.axis), axis=1), away @ np.array(laser.axis)))
 
 
 def _beam_text(laser: Laser) -> str:
@@ -498,7 +499,7 @@ def _check_focus(survey: Survey) -> None:
 
 
 def _check_ports(survey: Survey) -> None:
-    """The view through a port, and whether a surface is where the water ends."""
+    """The view through a port, and where it bends the beam."""
     scene, port = survey.scene, survey.camera_port
     if port is not None:
         left, top, right, bottom = scene.camera.view_box
@@ -511,20 +512,20 @@ def _check_ports(survey: Survey) -> None:
         else:
             text = f"through it the camera sees {wide:.3g} x {tall:.3g}° of the water; intrinsics are those in air"
             survey.note("camera.port", text, wide_deg=wide, tall_deg=tall)
-    low, high = np.array(scene.domain.bounds)
-    for name, surface, place in (
-        ("camera", scene.camera.port, np.array(scene.camera.position)),
-        ("laser", scene.laser.port, to_world(scene.camera, scene.beam.position)),
-    ):
-        is_surface = isinstance(surface, Port) and surface.shape == "flat" and surface.thickness == 0.0
-        if is_surface and (low <= place).all() and (place <= high).all():
-            text = "without a window it is a calm surface, but no face of the domain ends the water there: domain"
-            survey.warn(f"{name}.port", text)
+    if survey.laser_port is not None and scene.scan_positions == 1:
+        (start, along), distance = survey.beam_axis, survey.distance
+        point, bend = start + distance * along, math.degrees(math.acos(min(float(along @ scene.beam.axis), 1.0)))
+        ahead = point / np.linalg.norm(point) if port is None else port.connect(point, np.zeros(3))[0]
+        inside = (survey.view[:, :3] / np.linalg.norm(survey.view[:, :3], axis=1, keepdims=True)) @ ahead
+        if (beside := -math.degrees(math.asin(inside.min()))) > 0.0 and bend > 0.1:
+            text = f"bends the beam by {bend:.3g}°: at {distance:.4g} m its axis is {beside:.3g}° beside the view, "
+            text += f"{_beam_text(scene.laser)}; none is bent in the centre of a dome"
+            survey.warn("laser.port", text, bend_deg=bend, beside_deg=beside)
 
 
 def _check_scan(survey: Survey) -> None:
     """Whether the beam of a confocal scan is where its pixel looks, and what of the detector is then one pixel's."""
-    scene, laser, axis = survey.scene, survey.scene.beam, survey.on_axis
+    scene, laser, distance = survey.scene, survey.scene.beam, survey.distance
     if scene.scan_positions == 1:
         return
     if scene.laser.direction != Laser().direction:
@@ -541,13 +542,13 @@ def _check_scan(survey: Survey) -> None:
         if value := getattr(scene.detector, name):
             text = f"{name} = {value:g} is drawn between positions of the scan, where one pixel looks at all of them"
             survey.note(f"detector.{name}", text, **{name: value})
-    if axis is None:
+    if survey.on_axis is None:
         return
-    aside = math.hypot(*laser.position[:2]) * abs(1.0 - axis.distance / scene.scan.distance)
-    spot = laser.beam_radius if laser.profile == "collimated" else math.tan(min(laser.half_angle, 1.5)) * axis.distance
-    pixel = scene.camera.pixel_tangent * axis.distance
+    aside = math.hypot(*laser.position[:2]) * abs(1.0 - distance / scene.scan.distance)
+    spot = laser.beam_radius if laser.profile == "collimated" else math.tan(min(laser.half_angle, 1.5)) * distance
+    pixel = scene.camera.pixel_tangent * distance
     if aside > spot + pixel:
-        text = f"at {axis.distance:.4g} m the beam is {aside:.3g} m beside what its pixel sees ({pixel:.3g} m wide, "
+        text = f"at {distance:.4g} m the beam is {aside:.3g} m beside what its pixel sees ({pixel:.3g} m wide, "
         text += f"the spot's radius is {spot:.3g} m): scan.distance makes them cross"
         survey.warn("scan.distance", text, aside=aside, spot=spot, pixel=pixel)
 
@@ -564,7 +565,7 @@ def _check_shots(survey: Survey) -> None:
     for number, (middle, radius) in enumerate(survey.balls):
         if (aside := float(shots.aside(middle).min())) > radius + wide:
             survey.warn(f"targets[{number}]", f"no shot looks at it: all pass {aside:.4g} m beside it", aside=aside)
-    distance, (start, along) = (survey.target_range or (survey.range_of(scene.gate.stop),))[0], shots.lines()
+    distance, (start, along) = survey.distance, shots.lines()
     gaps = [np.linalg.norm(np.diff(start + distance * along, axis=k), axis=2).ravel() for k in (1, 0)]
     in_row, rows = (float(np.median(gap)) if gap.size else 0.0 for gap in gaps)
     text = f"at {distance:.4g} m pixels of a row are {in_row:.3g} m apart, rows {rows:.3g} m"
@@ -595,8 +596,7 @@ def _check_timing(survey: Survey) -> None:
         text = f"bin_width_ps = {gate.bin_width_ps:.4g} is coarser than the instrument response, "
         text += f"{survey.irf_fwhm_ps:.4g} ps: depth is resolved to {survey.bin_range:.3g} m"
         survey.note("gate.bin_width_ps", text, irf_fwhm_ps=survey.irf_fwhm_ps)
-    medium, index = survey.scene.medium, survey.scene.medium.group_index
-    distance = survey.target_range[0] if survey.target_range else survey.range_of(gate.stop)
+    medium, index, distance = survey.scene.medium, survey.scene.medium.group_index, survey.distance
     if index in (_FRESH, _SEA) and abs(laser.wavelength_nm - 532.0) > 10.0 and laser.is_visible:
         true = group_index(laser.wavelength_nm, salinity=35.0 * (index == _SEA))
         error = distance * (true / index - 1.0)
@@ -631,7 +631,7 @@ def _check_spectrum(survey: Survey) -> None:
         return
     field = "laser.linewidth_nm" if laser.spectrum is None else "laser.spectrum"
     try:
-        waters, path = water_lines(scene), 2.0 * survey.on_axis.distance
+        waters, path = water_lines(scene), 2.0 * survey.distance
     except ConfigError as error:
         survey.note(field, f"the analytic simulator refuses it: {error.problems[0].removeprefix('laser: ')}")
         return
@@ -726,8 +726,8 @@ def _check_statistics(survey: Survey) -> None:
     if axis is None:
         return
     signal, samples, traced = axis.signal_per_pulse, axis.samples_per_pixel, _photons(scene)
-    text = f"optical depth to the nearest illuminated point {axis.optical_depth:.3g} one way ({axis.distance:.4g} m); "
-    text += f"a pixel on the beam's axis detects {signal:.3g} unscattered photons a pulse"
+    text = f"optical depth to the nearest illuminated point {axis.optical_depth:.3g} one way ({survey.distance:.4g} m);"
+    text += f" a pixel on the beam's axis detects {signal:.3g} unscattered photons a pulse"
     survey.note("medium.extinction", text, optical_depth=axis.optical_depth, signal_per_pulse=signal)
     if signal > 0.05:
         text = f"{signal:.3g} target detections per pulse and pixel: first-photon counting piles up"
@@ -854,7 +854,7 @@ def _check_grid(survey: Survey) -> None:
     if all((((corners @ planes[:, :3].T + planes[:, 3]) < 0.0).all(axis=0).any()) for planes in both):
         survey.warn("medium.grid", "lies beside the view and the beam: single scattering does not show it")
     else:
-        begin, end = (0.0, 0.0, 0.0), (0.0, 0.0, 0.5 * scene.path_limit if axis is None else axis.distance)
+        begin, end = (0.0, 0.0, 0.0), (0.0, 0.0, 0.5 * scene.path_limit if axis is None else survey.distance)
         depth, without = scene.optical_depth(begin, end), scene.medium.extinction * end[2]
         where = "to the end of the gate" if axis is None else "to the target's range"
         text = f"optical depth along the axis {where} ({end[2]:.4g} m): {depth:.3g} one way, {without:.3g} without it"

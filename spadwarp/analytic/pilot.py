@@ -25,11 +25,12 @@ from spadwarp.frames import Frames, detect, detector_response, first_photon_prob
 from spadwarp.frames.depth import METHODS, Method, arrival_time
 from spadwarp.frames.response import FWHM_PER_SIGMA
 from spadwarp.result import Channel, Result, analyser_channel, merge
+from spadwarp.result.analysis import off_edges
 from spadwarp.scene import Scene, noise_rate
 from spadwarp.scene.camera import pixel_directions
 from spadwarp.scene.sight import depth_from_time, depth_per_time
 from spadwarp.transport import Progress, RunOptions, known_light, simulate, truth_maps
-from spadwarp.values import ConfigError, SpadwarpWarning
+from spadwarp.values import ConfigError, SpadwarpWarning, range_from_time
 
 __all__ = ["Pilot"]
 
@@ -37,7 +38,8 @@ Mask = NDArray[np.bool_]
 
 _SIDE = 16  # largest width and height of the window [pixels]
 _MOST_NOISE = 0.95  # part of the information that may be noise; a bound from what is left of more would be noise itself
-_MOST_DRAWN, _OCTAVES = 1 << 19, 8  # counts that are drawn at a time, for 1 to 4^7 times the pulses
+_MOST_DRAWN, _OCTAVES = 1 << 20, 8  # counts that are drawn at a time, for 1 to 4^7 times the pulses
+_OFFSETS = 8  # of the bins against the target: nobody knows where in a bin it lies
 _MEAN_OF_90 = 0.657  # mean of the smallest 90 % of the moduli of normal errors, over their standard deviation
 RUNS = 8  # of a quarter of the photons each two, whose scatter tells the noise of all
 
@@ -53,6 +55,7 @@ class Pilot:
     pixels that each have a few heavy photons is too low."""
 
     pixels: int  # with a target
+    surfaces: tuple[float, ...]  # depths in the window, of a twentieth of these pixels each, that edges separate [m]
     unscattered: float  # detections of the target per pulse in the gate, without scattered light
     target: float  # the same with it
     backscatter: float  # of backscatter, and of light that met the surface of a sea alone
@@ -99,8 +102,8 @@ def window(scene: Scene, device: str | None = None) -> Scene:
 
 
 def typical_pixels(scene: Scene, device: str | None = None) -> Mask:
-    """The third of the pixels with a target whose unscattered light is nearest to the median: what is known of it
-    without a photon does not choose pixels by their noise. bool `[H, W]`."""
+    """The third of the pixels with a target, off its edges, whose unscattered light is nearest to the median: what is
+    known of it without a photon does not choose pixels by their noise. bool `[H, W]`."""
     truth = truth_maps(scene, device=device)
     if scene.surface is None:
         light = known_light(scene, None, pick_device(device)).direct.numpy().sum(axis=-1, dtype=np.float64)
@@ -110,9 +113,9 @@ def typical_pixels(scene: Scene, device: str | None = None) -> Mask:
         surface: Any = {"distance": truth.range.ravel(), "normal": normal, "reflectance": truth.reflectance.ravel()}
         maps, _ = pixel_maps(scene, view=view, **surface, device=device, outliers=False)
         light = maps["signal"].reshape(truth.depth.shape)
-    light[np.isnan(truth.depth)] = np.nan
-    off = np.abs(light - np.nanmedian(light))
-    chosen = np.argsort(off, axis=None, kind="stable")[: max(1, np.isfinite(light).sum() // 3)]
+    hit = np.isfinite(truth.depth)
+    off = np.where(off_edges(truth.depth)[0], np.abs(light - np.median(light[hit])), np.nan)
+    chosen = np.argsort(off, axis=None, kind="stable")[: max(1, hit.sum() // 3)]
     return np.isin(np.arange(light.size), chosen).reshape(light.shape)
 
 
@@ -181,24 +184,28 @@ def measure(
             source=scene.source,
         )
 
-    def median(values: Any) -> float:
-        values = np.asarray(values)[seen]
-        finite = values[np.isfinite(values)]
-        return float(np.median(finite)) if finite.size else math.inf
+    def median(values: Floats, axis: int | None = None) -> Any:
+        finite = values[np.isfinite(values).all(axis=-1)]
+        return np.median(finite, axis) if len(finite) else math.inf
 
     def errors(frames: Frames, histogram: Any) -> dict[str, Any]:
-        """Depth by each estimator, from a histogram without noise, less the true depth [m]."""
+        """Depth by each estimator, from a histogram without noise, less the true depth [m], at offsets of the bins
+        (last axis): the time within a bin is lost, so that the error moves with the target's place in it."""
         times = {method: _time(frames, histogram, frames.background, method, device) for method in METHODS}
-        return {name: depth_from_time(time, scene=both.scene) - both.truth.depth for name, time in times.items()}
+        depths = {name: depth_from_time(time, scene=both.scene) for name, time in times.items()}
+        return {name: ((depth - both.truth.depth)[..., None] + moved)[seen] for name, depth in depths.items()}
 
+    pool, offsets = _Pool(both, typical), (np.arange(_OFFSETS) + 0.5) / _OFFSETS
+    places = (both.true_path() / both.scene.medium.pulse_speed - scene.gate.start) / scene.gate.bin_width % 1.0
+    moved = (places[..., None] - offsets) * pool.slope * scene.gate.bin_width
     error, unscattered = errors(frames, light), errors(clear_frames, clear_frames.expected.astype(np.float64))
-    bias = {method: median(values) for method, values in error.items()}
+    bias = {method: float(median(values)) for method, values in error.items()}
+    moduli = {method: np.abs(median(values, 0) if even else values) for method, values in error.items()}
     piled: dict[str, float] = {method: 0.0 for method in METHODS}
     if scene.detector.mode == "first_photon":
         recorded = errors(frames, first_photon_probabilities(light, device=device))
-        piled = {method: median(recorded[method] - error[method]) for method in METHODS}
+        piled = {method: float(median(recorded[method] - error[method])) for method in METHODS}
     scale = both.scene.laser.photons_per_pulse * scene.detections_per_photon
-    pool = _Pool(both, typical)
     returned, constant = pool(signal), pool(background)
     peak, level = _return(returned, constant, both.scene)
     bound, shot, information_noise = _bounds(both, (first, second), pool, device)
@@ -209,6 +216,7 @@ def measure(
     lights = [run.tallies[:2].sum(axis=(0, 3), dtype=np.float64)[seen] for run in (first, second)]
     return Pilot(
         pixels=int(seen.sum()),
+        surfaces=_surfaces(both),
         unscattered=float(both.component("ballistic")[typical].sum(axis=-1).mean() * scale),
         target=float(returned.sum()),
         backscatter=float(_background(both)[typical].sum(axis=-1).mean() * scale),
@@ -217,9 +225,9 @@ def measure(
         bound=bound,
         shot_noise=shot,
         information_noise=information_noise,
-        floor={name: abs(bias[name]) if even else median(np.abs(values)) for name, values in error.items()},
+        floor={name: float(np.median(values) if even else median(values)) for name, values in moduli.items()},
         bias=bias,
-        unscattered_floor={name: median(np.abs(values)) for name, values in unscattered.items()},
+        unscattered_floor={name: float(median(np.abs(values))) for name, values in unscattered.items()},
         pile_up=piled,
         peak=float(peak),
         level=float(level),
@@ -240,7 +248,7 @@ def _excess(
 ) -> tuple[tuple[float, float], ...]:
     """See `Pilot`: arrival times of counts that are drawn from `light` [T] against that of `light` itself; `bound` for
     one pulse [s]. The largest tenth of the errors, false peaks, are left out."""
-    drawn, random, found = int(np.clip(_MOST_DRAWN // len(light), 16, 512)), np.random.default_rng(0), []
+    drawn, random, found = int(np.clip(_MOST_DRAWN // len(light), 16, 4096)), np.random.default_rng(0), []
     if frames.detector.mode == "first_photon":
         light = first_photon_probabilities(light[None, None], device=device)[0, 0]
     for pulses in first * 4.0 ** np.arange(_OCTAVES):
@@ -262,6 +270,15 @@ def _brightest(first: Floats, second: Floats) -> float:
     pairs = ((first, second), (second, first))
     top = [mine.ravel()[np.argsort(uniform_filter(other, 3), axis=None)[-count:]] for mine, other in pairs]
     return float(np.mean(top)) or float((first + second).max()) / 2.0
+
+
+def _surfaces(result: Result) -> tuple[float, ...]:
+    """See `Pilot`: depths lie farther apart than the returns of two can be told, and than those of a slope do."""
+    depth = np.sort(result.truth.depth[np.isfinite(result.truth.depth)])
+    resolved = range_from_time(FWHM_PER_SIGMA * response_deviation(result.scene), result.scene.medium.group_index)
+    apart = max(resolved, 3.0 * off_edges(result.truth.depth)[1])
+    parts = np.split(depth, np.flatnonzero(np.diff(depth) > apart) + 1)
+    return tuple(float(np.median(part)) for part in parts if 20 * len(part) >= len(depth))
 
 
 def response_deviation(scene: Scene) -> float:

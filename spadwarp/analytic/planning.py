@@ -233,6 +233,9 @@ def plan(
         scene = with_plane(scene, span[1])
     if problem:
         raise ConfigError(problem, source=scene.source)
+    if planner.depth_error > span[0]:
+        nearest = f"the range of the target, {span[0]:.3g} m; numbers are in m"
+        raise ArgumentError(f"depth_error = {planner.depth_error:g} m is more than {nearest}")
     proposal = planner.propose(with_gate(scene, span, planner.margin), span, number)
     if eye_distance is not None and not isinstance(scene.medium.albedo, str):
         water = safe_distance_in_water(proposal.scene, exposure=planner.eye_exposure, seed=seed, device=device)
@@ -287,6 +290,10 @@ class _Sample(NamedTuple):
         for name in ("bound", "shot_noise", "peak"):
             best[name], worst[name] = ends([getattr(one, name) for one in every], ratio=True)
         worst["peak"], best["peak"] = best["peak"], worst["peak"]
+        noise = [ends([float(_noise(one, n)) * math.sqrt(n) for one in every], ratio=True) for n, _ in centre.excess]
+        for i, side in enumerate((best, worst)):
+            ratios = [max(pair[i] / side["bound"], 1.0) for pair in noise]
+            side["excess"] = tuple((n, ratio) for (n, _), ratio in zip(centre.excess, ratios, strict=True))
         best["level"], worst["level"] = ends([one.level for one in every], ratio=False)
         for name in ("floor", "pile_up"):
             pairs = {key: ends([abs(getattr(one, name)[key]) for one in every], ratio=False) for key in METHODS}
@@ -394,8 +401,7 @@ class _Planner:
         self, scene: Scene, runs: Sequence[Result], typical: Mask, even: bool
     ) -> tuple[Scene, str, float, Pilot]:
         """The scene with its pulse energy, what sets it, that of pile-up; and what an even number of runs measured."""
-        options: dict[str, Any] = {"even": even, "channel": self.channel, "depth_error": self.depth_error}
-        options["method"] = self.method if len(runs) == RUNS else "likelihood"  # parts have the noise of all
+        options: Any = {"even": even, "channel": self.channel, "depth_error": self.depth_error, "method": self.method}
         found = measure(runs, scene, typical, self.device, **options)
         piled = scene.laser.pulse_energy * max(PILE_UP - found.noise, 0.0) / found.brightest
         allowed = {"pile-up": piled} | ({} if self.eye_distance is None else {"eye": self._eye(scene).pulse_energy})

@@ -14,7 +14,7 @@ from spadwarp.cli import options as opt
 from spadwarp.cli.app import complain, note, say, wrong
 from spadwarp.cli.options import command
 from spadwarp.cli.outputs import answer, check_outputs, progress, rows, show_table, write_json, written
-from spadwarp.values import ArgumentError, ConfigError, FileError, count, percent, range_from_time, rounded
+from spadwarp.values import ArgumentError, ConfigError, FileError, count, percent, rounded
 
 if TYPE_CHECKING:
     from spadwarp import Result, Scene
@@ -84,14 +84,12 @@ def detect(
     files = [recording.file.path, spadwarp.viz.draw(recording.file, out / "frame.png", pixel=pixel)]
     found = _recorded(recording, frames)
     each, limit = found["detections_per_pulse_and_pixel"], spadwarp.analytic.PILE_UP
-    if (
-        each > limit
-        and scene.detector.mode == "first_photon"
-        and not coates
-        and recording.file.target_noise_ratio != math.inf
-    ):
+    light = float(result.detections.sum(axis=2).mean())
+    lost = light > 0.0 and recording.file.target_noise_ratio == math.inf  # all of it, which is said already
+    if each > limit and scene.detector.mode == "first_photon" and not (coates or lost):
         text = f"pile-up: {each:.2g} detections per pulse and pixel, more than {limit:g}, shift depth towards the laser"
-        complain(f"{text}; less laser.pulse_energy, or --coates", "warning")
+        less = "laser.pulse_energy" if light > 0.5 * each else "dark counts and ambient light"
+        complain(f"{text}; less {less}, or --coates", "warning")
     answer({**found, "channel": channel, "files": files})
 
 
@@ -379,13 +377,19 @@ _OF_IMAGES = {"channel": str, "scale": opt.real_number, "as_depth": bool}
 _DenoiseInputs = Annotated[dict[str, Any], opt.items(opt.MEASURED | _SEEN | _OF_IMAGES)]
 
 
+def _gate(text: str) -> tuple[str, tuple[float, float]]:
+    """Name and value of the argument for a gate in depth, or in time of flight."""
+    in_time = "s" in text  # which no unit of length has
+    return ("gate_time", opt.from_to("s")(text)) if in_time else ("gate", opt.from_to("m")(text))
+
+
 @command()
 def denoise(
     path: Path,
     *,
     out: Path,
     model: str = "pyramid",
-    gate: str | None = None,
+    gate: Annotated[tuple[str, tuple[float, float]], _gate] | None = None,
     profile: Path | None = None,
     background: str | None = None,
     weights: Path | None = None,
@@ -414,8 +418,8 @@ def denoise(
             folder of them.
         model: pyramid, histograms, dncnn, usdn; or median, gating, bm3d; for counts also likelihood, pooled,
             semi-global, total-variation, belief-propagation.
-        gate (FROM:TO): Gate in depth, such as 13.5:16 [m]; also in time, such as 90ns:110ns, with --input group_index.
-            By default that of the file, or the range of its depths.
+        gate (FROM:TO): Gate in depth, such as 13.5:16 [m]; also in time of flight, such as 90ns:110ns. By default
+            that of the file, or the range of its depths.
         profile: .npy with the water's backscatter over the gate in equal bins.
         weights: Weights of spadwarp train. By default the package's.
         mask (P): Leave out pixels that see a target with less than this probability: 0.08 for PyramidNet of depth, 0.5
@@ -434,7 +438,6 @@ def denoise(
     from spadwarp.denoise import denoise_file, depth_files
 
     facts, files = opt.read_measured(inputs)
-    depths = None if gate is None else _gate(gate, facts.get("group_index"))
     paths = depth_files(path)
     stems = [one.stem for one in paths]
     if twice := sorted({one for one in stems if stems.count(one) > 1}):
@@ -443,7 +446,8 @@ def denoise(
     names = [stem + ending for stem in stems for ending in _ENDINGS]
     level, known = _background(background)
     check_outputs(out, names, inputs=(*paths, profile, level, weights, *files), needed=needed)
-    settings: dict[str, Any] = {"model": model, "gate": depths, "weights": weights, "device": device, "mask": mask}
+    settings: dict[str, Any] = {"model": model, "weights": weights, "device": device, "mask": mask}
+    settings |= dict([] if gate is None else [gate])
     settings |= {"min_significance": min_significance, "background": known, "precision": precision}
     settings["profile"] = None if profile is None else spadwarp.io.read_npy(profile, largest=1 << 20)
     lines: dict[str, str] = {}
@@ -472,17 +476,3 @@ def denoise(
     write_json({"model": model, "files": summary})
     if len(summary) < len(paths):
         raise FileError(f"{path}: {len(paths) - len(summary)} of {len(paths)} files could not be denoised")
-
-
-def _gate(text: str, group_index: float | None) -> tuple[float, float]:
-    """Depths [m] of a gate in depth, or in time of flight."""
-    try:
-        if "s" not in text:  # which no unit of length has
-            return opt.from_to("m")(text)
-        start, stop = opt.from_to("s")(text)
-    except typer.BadParameter as error:
-        wrong(error.message, "--gate")
-    if group_index is None:
-        problem = "is in time of flight: --input group_index=N makes depth of it; or give two lengths"
-        wrong(f"{text!r} {problem}", "--gate")
-    return range_from_time(start, group_index), range_from_time(stop, group_index)

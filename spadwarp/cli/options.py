@@ -151,15 +151,20 @@ def real_number(text: str | float) -> float:
     return number
 
 
-def from_unit(unit: str) -> Callable[[str | float], float]:
-    """A number in the unit, bare or with a unit of its own: `0.01` or `1cm` for m."""
+def from_unit(unit: str, bare: float = math.inf) -> Callable[[str | float], float]:
+    """A number in the unit, or with one of its own: `0.01` or `1cm` for m; a bare one above `bare` is not meant so."""
 
     def parse(text: str | float) -> float:
         word = str(text).strip()
         try:
-            return real_number(word) if word[-1:] in "0123456789." else quantity(word, unit)
+            number = real_number(word) if word[-1:] in "0123456789." else quantity(word, unit)
         except ValueError as error:
             raise typer.BadParameter(f"{shown(text)} {error}") from None
+        if word[-1:] in "0123456789." and number > bare:
+            raise typer.BadParameter(
+                f"{word} without a unit is in {unit}; write the unit, such as {word}m{unit} or {word}{unit}"
+            )
+        return number
 
     return parse
 
@@ -247,6 +252,7 @@ def number_or_text(text: str) -> float | str:
 
 
 Length = Annotated[float, from_unit("m")]
+DepthError = Annotated[float, from_unit("m", bare=0.2)]
 Seconds = Annotated[float, from_unit("s")]
 Photons = Annotated[int, _photons]
 """A whole number, or "auto"."""

@@ -71,7 +71,7 @@ _Range = Annotated[tuple[float, float], opt.from_to("m")]
 def plan(
     scene: Path,
     *,
-    depth_error: opt.Length = 0.01,
+    depth_error: opt.DepthError = 0.01,
     time: opt.Seconds = 1.0,
     range_: _Range | None = None,
     margin: opt.Length = 0.25,
@@ -163,24 +163,28 @@ def plan(
 
 
 def _verdict(found: Proposal) -> str:
-    """One sentence."""
+    """One sentence; where the pixels that were measured see several surfaces, a second."""
     asked, total = with_prefix(found.depth_error, "m"), with_prefix(found.terms["total"], "m")
     if not found.judged:
         traced = found.pilot.photons
         return f"A depth error of {asked}: not enough photons to judge, {traced:.1e} were traced; {found.more_photons}."
-    if found.pulses_for == "out of reach":
-        return f"A depth error of {asked} is out of reach: 2^31 pulses are too few; limit: {found.limit}."
     least, most = found.pulses_range
     between = f" ({count(least)} to {count(most)})" if most > 1.3 * least else ""
     pulses = f"{count(found.pulses)} pulses{between}, {with_prefix(found.frame_time, 's')}"
     if found.pulses_for == "false peaks":
         pulses += ", for fewer than 1 % false peaks"
     if found.reached:
-        return f"A depth error of {asked} is reached with {pulses} ({total}); limit: {found.limit}."
-    if found.pulses_for in ("depth error", "false peaks"):
-        longest = with_prefix(found.time, "s")
-        return f"A depth error of {asked} takes {pulses}, more than {longest}; limit: {found.limit}."
-    return f"A depth error of {asked} is out of reach: {total} with {pulses}; limit: {found.limit}."
+        text = f"is reached with {pulses} ({total})"
+    elif found.pulses_for in ("depth error", "false peaks"):
+        text = f"takes {pulses}, more than {with_prefix(found.time, 's')}"
+    else:
+        few = found.pulses_for == "out of reach"
+        text = f"is out of reach: {'2^31 pulses are too few' if few else f'{total} with {pulses}'}"
+    sentence = f"A depth error of {asked} {text}; limit: {found.limit}."
+    if len(found.pilot.surfaces) > 1:
+        depths = ", ".join(f"{depth:.3g}" for depth in found.pilot.surfaces)
+        sentence += f" Edges near the axis, between depths of {depths} m: a frame's median may be less or more."
+    return sentence
 
 
 def _terms(found: Proposal) -> dict[str, str]:
@@ -197,8 +201,7 @@ def _terms(found: Proposal) -> dict[str, str]:
         "forward scattering": f"{found.method}; does not fall with the pulses; {floors}; from {count(pilot.photons)} "
         f"traced photons; {unscattered}",
         "pile-up": "change of the median depth",
-        "total": "root of the sum of squares, near the axis; the median error that `spadwarp detect` reports is of the "
-        "whole frame and may be less or more",
+        "total": "root of the sum of squares, near the axis; `spadwarp detect` reports the median of the whole frame",
     }
     title = f"depth error, {count(found.pulses)} pulses"
     return {title: "mm"} | {name: f"{short(1000 * value):<6}  {about[name]}" for name, value in found.terms.items()}
@@ -212,7 +215,7 @@ def sweep(
     medium: list[str] | None = None,
     reflectance: float | None = None,
     of: Literal["budget", "plan"] | None = None,
-    depth_error: opt.Length = 0.01,
+    depth_error: opt.DepthError = 0.01,
     time: opt.Seconds = 1.0,
     method: opt.Method = "likelihood",
     photons: int | None = None,

@@ -2,26 +2,23 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import replace
-from typing import Literal, get_args
+from pathlib import Path
+from typing import Any, Literal, get_args
 
 import numpy as np
 from numpy.typing import NDArray
 
 from spadwarp.denoise.frames import DepthFrames, fill_missing
-from spadwarp.denoise.network_files import MODELS
-from spadwarp.values import SpadwarpError
+from spadwarp.denoise.network_files import MODELS, weights_header
+from spadwarp.io.paths import existing_file
+from spadwarp.values import ArgumentError, FileError, SpadwarpError, check_choice
 
 Frames = NDArray[np.float32]
 
 MEDIAN_WINDOWS = (3, 5, 7, 9, 11)
 """Sides of the median's window that are tried [pixels]."""
-
-
-def unfiltered(frames: DepthFrames) -> Frames:
-    """The frames as they are, `[N, H, W]` [m]; a pixel without a depth counts as one in the middle of the gate."""
-    return np.nan_to_num(frames.depth, nan=frames.gate_middle)
 
 
 def median_filter(frames: DepthFrames, *, window: int = 5) -> Frames:
@@ -85,7 +82,7 @@ def bm3d_filter(frames: DepthFrames) -> Frames:
 
 
 BASELINES: dict[str, Callable[[DepthFrames], Frames]] = {
-    "input": unfiltered,
+    "input": lambda frames: np.nan_to_num(frames.depth, nan=frames.gate_middle),
     "median": median_filter,
     "gating": gated_filter,
     "bm3d": bm3d_filter,
@@ -106,3 +103,24 @@ METHODS = (*MODELS, *(name for name in BASELINES if name != "input"), *CLASSICAL
 
 FROM_COUNTS = ("histograms", *CLASSICAL)
 """Those that use counts."""
+
+
+def compared(models: Sequence[str], weights: str | Path | None, *, counts: bool = False) -> dict[str, dict[str, Any]]:
+    """`model` and `weights` of each method of a comparison, by its name, the input first; of own weights it is "own".
+
+    Raises `ArgumentError`: no such method; one, or weights, of histograms where there are no `counts`.
+    """
+    for name in models:
+        check_choice("models", name, METHODS)
+        if name in FROM_COUNTS and not counts:
+            problem = "needs histograms with their background, which datasets do not keep; evaluate a result"
+            raise ArgumentError(f"models: {name!r} {problem}")
+    methods: dict[str, dict[str, Any]] = {name: {"model": name, "weights": None} for name in ("input", *models)}
+    if weights is None:
+        return methods
+    model = weights_header(existing_file(weights)).get("model")
+    if model not in MODELS:
+        raise FileError(f"{weights}: not weights of spadwarp train: its header names no network")
+    if model == "histograms" and not counts:
+        raise ArgumentError(f"weights = '{weights}' are of the network for histograms; evaluate a result with them")
+    return methods | {"own": {"model": model, "weights": Path(weights)}}

@@ -80,6 +80,7 @@ def read_depth(
     method: Method | None = None,
     background: ArrayLike | BackgroundLaw | None = None,
     gate: tuple[float, float] | None = None,
+    gate_time: tuple[float, float] | None = None,
     device: str | None = None,
     **measured: Any,
 ) -> DepthReading:
@@ -101,6 +102,7 @@ def read_depth(
         background: Of counts whose response is known, as `spadwarp.denoise.estimate` takes it, replacing the file's;
             default: the file's, else "decay".
         gate: (start, stop) in depth [m]; of counts whose response is known, only the bins within it are used.
+        gate_time: The same in time of flight [s], by the group index of the file or the one that is given.
         device: Warp device of the estimator.
         measured: What a file of measured histograms does not say, as `read_histograms` takes it, and `group_index` and
             `horizontal_fov_deg`, as `depth_of` does.
@@ -109,9 +111,7 @@ def read_depth(
         FileError: No such file, not readable, or without depth.
         ArgumentError: An argument out of range, or missing for what the file holds.
     """
-    if gate is not None:
-        gate = checked_gate(gate)
-    place = locate(path)
+    place, gate = locate(path), None if gate is None else checked_gate(gate)
     if place.suffix.lower() not in ENDINGS and not place.is_dir():
         raise FileError(f"{existing_file(place)}: ending {place.suffix!r} is not one of {', '.join(ENDINGS)}")
     if not (np.isfinite(scale) and scale > 0):
@@ -125,7 +125,8 @@ def read_depth(
         if own is not None:
             frames = own.values.astype(np.float32)
             source = f"depth as it is{_remark(held)}"
-            return DepthReading(depth=frames, frames=True, gate=gate_of(held), profile=None, source=source, truth=truth)
+            gate = _in_depth(gate_time, place, measured.get("group_index")) or gate_of(held)
+            return DepthReading(depth=frames, frames=True, gate=gate, profile=None, source=source, truth=truth)
     found = _stored_depth(place, channel, measured.get("dataset"), as_depth)
     if found is not None:
         stored, chosen = found
@@ -143,8 +144,15 @@ def read_depth(
             warnings.warn(f"{text}, per unit of the file, or gate may be wrong", SpadwarpWarning, stacklevel=2)
         source = "depth as it is" + (f": {chosen}" if chosen else "")
         source += f"; {below} values below 0 count as not reported" if below else ""
-        return DepthReading(depth=frames, frames=depth.ndim == 3, gate=None, profile=None, source=source)
-    histograms = _read_histograms(place, measured | of_result)
+        gate = _in_depth(gate_time, place, measured.get("group_index"))
+        return DepthReading(depth=frames, frames=depth.ndim == 3, gate=gate, profile=None, source=source)
+    view = [measured.pop(name, None) for name in ("group_index", "horizontal_fov_deg")]
+    histograms = with_view(read_histograms(place, **measured, **of_result), *view)
+    if histograms.scene is None and histograms.response is None:
+        text = "the instrument response is not given (irf): with it, counts are denoised with their histograms"
+        histograms = dataclasses.replace(histograms, notes=(*histograms.notes, text))
+    index = histograms.group_index if histograms.scene is None else histograms.scene.medium.group_index
+    gate = gate or _in_depth(gate_time, place, index)
     counted = histograms.values.dtype.kind in "iu" and histograms.response is not None
     if counted and histograms.bin_width is None:
         raise ArgumentError(f"{place}: bin width is missing (bin_width)")
@@ -154,16 +162,15 @@ def read_depth(
         raise ArgumentError(f"{place}: background is of counts whose instrument response (irf) is known")
     if counted and gate is not None:
         histograms = _within(histograms, gate)
-    return dataclasses.replace(_estimate_depth(histograms, counted, method, device), truth=truth)
+    read = _estimate_depth(histograms, counted, method, device)
+    return dataclasses.replace(read, truth=truth, gate=read.gate if counted else gate or read.gate)
 
 
-def _read_histograms(path: Path, measured: dict[str, Any]) -> Histograms:
-    view = [measured.pop(name, None) for name in ("group_index", "horizontal_fov_deg")]
-    histograms = with_view(read_histograms(path, **measured), *view)
-    notes = histograms.notes
-    if histograms.scene is None and histograms.response is None:
-        notes += ("the instrument response is not given (irf): with it, counts are denoised with their histograms",)
-    return dataclasses.replace(histograms, notes=notes)
+def _in_depth(times: tuple[float, float] | None, path: Path, index: float | None) -> tuple[float, float] | None:
+    """A gate [m] of one in time of flight [s]."""
+    if times is not None and index is None:
+        raise ArgumentError(f"{path}: a gate in time of flight needs a group index (group_index), or give two lengths")
+    return times and checked_gate((range_from_time(times[0], index or 1.0), range_from_time(times[1], index or 1.0)))
 
 
 def _with_background(held: Histograms, given: ArrayLike | BackgroundLaw | None) -> Histograms:

@@ -4,13 +4,12 @@ from __future__ import annotations
 
 import re
 import sys
-from collections.abc import Sequence
 from pathlib import Path
 from typing import Any, Literal
 
 from spadwarp.io.paths import existing_file
 from spadwarp.io.text import parse_json
-from spadwarp.values import ArgumentError, DeviceError, FileError, SpadwarpError, check_choice, need_memory, shown
+from spadwarp.values import DeviceError, FileError, SpadwarpError, check_choice, need_memory, shown
 
 __all__ = ["weights_metadata"]
 
@@ -45,22 +44,6 @@ def fast_precision(device: str) -> Precision:
         return "float16"
     capabilities: dict[str, Any] = getattr(require_torch().cpu, "get_capabilities", dict)()
     return "bfloat16" if capabilities.get("amx_bf16", False) else "float32"
-
-
-def compared(models: Sequence[str], weights: str | Path | None, *, counts: bool = False) -> dict[str, dict[str, Any]]:
-    """`model` and `weights` of each method of a comparison, by its name; that of own weights, if given, is "own".
-
-    Raises `ArgumentError` for weights of the network for histograms where there are no `counts`.
-    """
-    methods: dict[str, dict[str, Any]] = {name: {"model": name, "weights": None} for name in models}
-    if weights is None:
-        return methods
-    model = weights_header(existing_file(weights)).get("model")
-    if model not in MODELS:
-        raise FileError(f"{weights}: not weights of spadwarp train: its header names no network")
-    if model == "histograms" and not counts:
-        raise ArgumentError(f"weights = '{weights}' are of the network for histograms; evaluate a result with them")
-    return methods | {"own": {"model": model, "weights": Path(weights)}}
 
 
 def require_torch() -> Any:

@@ -225,8 +225,8 @@ def _is_matrix(parameter: Tensor) -> bool:
 class Trained:
     """Files and validation of a training.
 
-    A line of the log is JSON: step, loss, validation PSNR [dB] at each of `LEVELS` or `PHOTONS`, its mean and that of
-    the noisy input, pairs per second, s.
+    A line of the log, from step 0 on, is JSON: step, loss (null at 0), validation PSNR [dB] at each of `LEVELS` or
+    `PHOTONS`, its mean and that of the noisy input, pairs per second, s.
     """
 
     weights: Path
@@ -334,9 +334,8 @@ class Run:
             raise FileError(f"{self.checkpoint}: not whole; remove it to start anew: {error}") from error
         if self.log.is_file():  # a line is written before its checkpoint
             settings = self.recipe.optimiser
-            reports = kept["step"] // settings.interval
-            if kept["step"] == settings.steps:
-                reports = math.ceil(kept["step"] / settings.interval)
+            done = kept["step"] / settings.interval  # the first line is that of step 0
+            reports = 1 + (math.ceil if kept["step"] == settings.steps else math.floor)(done)
             lines = self.log.read_text(errors="replace").splitlines(keepends=True)[:reports]
             with atomic_path(self.log) as temporary:
                 temporary.write_text("".join(lines))
@@ -348,7 +347,7 @@ class Run:
         settings, now = self.recipe.optimiser, time.monotonic()
         line = {
             "step": self.step,
-            "loss": float(self.loss_sum) / (self.step % settings.interval or settings.interval),
+            "loss": float(self.loss_sum) / (self.step % settings.interval or settings.interval) if self.step else None,
             "psnr": {f"{level:.3f}": round(value, 3) for level, value in psnr.items()},
             "mean_psnr": round(fmean(psnr.values()), 3),
             "input_psnr": round(input_psnr, 3),
@@ -488,6 +487,8 @@ def fit(
     first, spent = run.step, 0.0
     psnr: dict[float, float] = {}
     input_psnr = fmean(validation_psnr(None, validation, recipe).values())
+    if run.step == 0 and not run.log.is_file():
+        run.report(validation_psnr(run.average, validation, recipe), input_psnr)
     with interruptible() as interrupted:
         while run.step < settings.steps and not interrupted.is_set():
             began = time.monotonic()

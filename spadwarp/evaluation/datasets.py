@@ -14,11 +14,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from spadwarp.dataset import FrameItem, FrameReader, read_manifest
-from spadwarp.denoise.baselines import FROM_COUNTS, MEDIAN_WINDOWS, METHODS
+from spadwarp.denoise.baselines import MEDIAN_WINDOWS, compared
 from spadwarp.denoise.frames import DepthFrames, depth_frames
 from spadwarp.denoise.inference import estimate_frames, target_threshold
-from spadwarp.denoise.network_files import compared
-from spadwarp.values import ArgumentError, FileError, check_choice, check_integer
+from spadwarp.values import ArgumentError, FileError, check_integer
 
 __all__ = ["Evaluation", "evaluate"]
 
@@ -254,20 +253,11 @@ def evaluate(
         FileError: No dataset, or no frames in the split; weights that cannot be read.
         SpadwarpError: A package of the extra `denoise` is missing.
     """
-    for name in models:
-        check_choice("models", name, [one for one in METHODS if one not in FROM_COUNTS or one == name])
     wanted = [name for name in dict.fromkeys(models) if name != "bm3d"] + ["bm3d"] * (bm3d_frames > 0)
-    if counting := [name for name in wanted if name in FROM_COUNTS]:
-        raise ArgumentError(
-            f"models: {counting[0]!r} needs histograms with their background, which datasets do not keep; "
-            "evaluate a result"
-        )
     frames = check_integer("frames", frames, "[1, 1000000000]")
     bm3d_frames = check_integer("bm3d_frames", bm3d_frames, "[0, 1000000000]")
-    comparison = _Comparison(
-        data, split, frames, crop, compared(["input", *wanted], None if weights is None else Path(weights)), device
-    )
-    return comparison.scored(bm3d_frames, progress)
+    methods = compared(wanted, None if weights is None else Path(weights))
+    return _Comparison(data, split, frames, crop, methods, device).scored(bm3d_frames, progress)
 
 
 class _Comparison:
@@ -330,11 +320,10 @@ class _Comparison:
             return
         count = self.frames[target, level] = self.frames.get((target, level), 0) + 1
         images: dict[str, NDArray[np.float32]] = {}
-        for method in self.methods:
+        for method, named in self.methods.items():
             if method == "bm3d" and count > bm3d_frames:
                 continue
             window = self.windows.get(level, 5)
-            named = self.methods[method]
             found = estimate_frames(noisy, window=window, device=self.device, **named)
             images[method] = found.masked(target_threshold(named["model"]))[0]
             self.scores.setdefault((method, target, level), []).append(score(clean, found.depth[0], gate=noisy.gate))

@@ -19,13 +19,12 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from spadwarp.denoise.baselines import FROM_COUNTS, MEDIAN_WINDOWS, METHODS
+from spadwarp.denoise.baselines import MEDIAN_WINDOWS, compared
 from spadwarp.denoise.frames import DepthFrames, depth_frames
 from spadwarp.denoise.inference import Estimate, estimate_frames, target_threshold
-from spadwarp.denoise.network_files import compared
 from spadwarp.denoise.recipe import LEVELS
 from spadwarp.evaluation.datasets import Steps, near_jumps, staircase_steps
-from spadwarp.values import ArgumentError, check_choice
+from spadwarp.values import ArgumentError
 
 __all__ = ["SceneScores", "evaluate_scenes"]
 
@@ -190,11 +189,6 @@ def _vase(y: _Image, x: _Image) -> _Image:
     return _nearest((body, 14.8 - np.sqrt(np.maximum(radius**2 - x**2, 0.0))), (handle, 14.8 + 0.0 * x))
 
 
-def _nothing(y: _Image, x: _Image) -> _Image:
-    """No shape at all."""
-    return np.full(y.shape, np.nan)
-
-
 SHAPES: dict[str, Callable[[_Image, _Image], _Image]] = {
     "stairs": _stairs,
     "rings": _rings,
@@ -203,7 +197,7 @@ SHAPES: dict[str, Callable[[_Image, _Image], _Image]] = {
     "spiral": _spiral,
     "lattice": _lattice,
     "vase": _vase,
-    "nothing": _nothing,
+    "nothing": lambda y, x: np.full(y.shape, np.nan),
 }
 """Shapes by name."""
 
@@ -262,10 +256,6 @@ class SceneScores:
         """The backscatter fractions."""
         return sorted({level for _, _, _, level, _ in self.rows})
 
-    def worse_than_input(self, method: str) -> int:
-        """Number of frames whose PSNR is below the input's."""
-        return sum(scores.gain < 0 for (name, *_), scores in self.rows.items() if name == method)
-
     def to_dict(self) -> dict[str, Any]:
         """Numbers and names, for JSON."""
         keys = ("method", "setting", "water", "level", "shape")
@@ -302,11 +292,9 @@ def evaluate_scenes(
         seed: Of the noise.
         weights, device, progress: See `evaluate`, as for errors.
     """
-    for name in models:
-        check_choice("models", name, [one for one in METHODS if one not in FROM_COUNTS])
     if scenes is None:
         scenes = [evaluation_scene(shape, setting) for setting in SETTINGS for shape in SHAPES]
-    chosen, methods = list(scenes), compared(["input", *models], weights)
+    chosen, methods = list(scenes), compared(models, weights)
     rows: dict[tuple[str, str, str, float, str], FrameScores] = {}
     best: dict[tuple[str, str, float], int] = {}
     reliability: dict[tuple[str, str], NDArray[np.int64]] = {}

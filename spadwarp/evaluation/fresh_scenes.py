@@ -60,7 +60,8 @@ _Light = tuple[_Image, _Image, _Image, _Image, tuple[float, float], str]
 def _drawn(random: np.random.Generator) -> _Light:
     height, width, bins = random.integers(40, 81), random.integers(40, 81), random.integers(64, 401)
     y, x = np.mgrid[:height, :width].astype(np.float64)
-    shape, texture, pulse, water = (_choice(random, family) for family in (SHAPES, TEXTURES, RESPONSES, BACKGROUNDS))
+    families: Any = SHAPES, TEXTURES, RESPONSES, BACKGROUNDS
+    shape, texture, pulse, water = (list(family)[random.integers(len(family))] for family in families)
     depth = SHAPES[shape](y, x, random)
     if random.random() < 0.5:  # a wall behind
         slope = random.uniform(-0.15, 0.15, 2)
@@ -85,10 +86,6 @@ def _drawn(random: np.random.Generator) -> _Light:
     response = np.convolve(taps, narrow, mode="same")
     clean = gate[0] + (gate[1] - gate[0]) * place
     return rate, background, response / response.sum(), clean, gate, f"{shape}, {texture}, {pulse}, {water}"
-
-
-def _choice(random: np.random.Generator, family: dict[str, Any]) -> str:
-    return list(family)[random.integers(len(family))]
 
 
 # Shapes: depth in any unit at pixels y, x, NaN beside them.

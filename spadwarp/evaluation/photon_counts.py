@@ -16,16 +16,15 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from spadwarp.denoise.baselines import FROM_COUNTS, MEDIAN_WINDOWS, METHODS
+from spadwarp.denoise.baselines import FROM_COUNTS, MEDIAN_WINDOWS, compared
 from spadwarp.denoise.frames import DepthFrames, depth_frames
 from spadwarp.denoise.histograms import CountFrames, count_frames
 from spadwarp.denoise.inference import estimate, estimate_frames, estimate_histograms, target_threshold
-from spadwarp.denoise.network_files import compared
 from spadwarp.frames.cramer_rao import crlb_from_histogram
 from spadwarp.frames.depth import arrival_time
 from spadwarp.frames.response import detector_response
 from spadwarp.scene.sight import depth_from_time, port_advance
-from spadwarp.values import SEED, SpadwarpError, check_choice, check_integer, check_real, count, range_from_time
+from spadwarp.values import SEED, SpadwarpError, check_integer, check_real, count, range_from_time
 from spadwarp.viz import evaluation as drawing
 
 if TYPE_CHECKING:
@@ -226,14 +225,12 @@ def photon_sweep(
     Raises:
         SpadwarpError: The result has no return, no backscatter or no instrument response.
     """
-    for model in models:
-        check_choice("models", model, METHODS)
     for name, values in (("photons", photons), ("sbr", sbr)):
         check_integer(f"number of {name}", len(values), "[1, 10000]")
         for value in values:
             check_real(f"{name}: an item", value, "[1e-9, 1e9]")
     frames, seed = check_integer("frames", frames, "[1, 1000000]"), check_integer("seed", seed, SEED)
-    methods = compared(["input", *models], weights, counts=True)
+    methods = compared(models, weights, counts=True)
     shape, truth, done = (len(sbr), len(photons)), result.truth.depth, 0
     squares = {name: np.zeros((len(MEDIAN_WINDOWS) if name == "median" else 1, *shape)) for name in methods}
     bound = np.zeros(shape)

@@ -72,7 +72,8 @@ def write_scene_report(scores: SceneScores, folder: str | Path) -> list[Path]:
         names, rows = scene_table(scores, setting, water)
         cells = [(name, [(text, False) for text in texts]) for name, *texts in rows]
         tables.append((f"{setting.capitalize()}, backscatter {water}: PSNR of the input, gains [dB]", names, cells))
-    worse = ", ".join(f"{TITLES[name]} {scores.worse_than_input(name)}" for name in scores.methods[1:])
+    below = [method for (method, *_), one in scores.rows.items() if one.gain < 0]
+    worse = ", ".join(f"{TITLES[name]} {below.count(name)}" for name in scores.methods[1:])
     texts = {
         "data": "Scenes that no training saw",
         "frames": len(scores.rows) // len(scores.methods),

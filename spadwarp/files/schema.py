@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Mapping
+from collections.abc import Mapping
 from typing import Any
 
 from pydantic import BaseModel
@@ -37,7 +37,9 @@ def json_schema(model: type[BaseModel]) -> dict[str, Any]:
     title = "scene" if scene else "dataset" if dataset else "training"
     schema = {"$schema": "https://json-schema.org/draft/2020-12/schema", **schema, "title": f"spadwarp {title}"}
     if dataset:
-        schema["$defs"]["Distribution"] = _distribution(schema["$defs"]["Distribution"])
+        table = {**schema["$defs"]["Distribution"], "title": "table"}  # besides a number and a list of values
+        kinds = [{"type": kind} for kind in ("number", "string", "boolean", "array")]
+        schema["$defs"]["Distribution"] = {"title": "Distribution", "anyOf": [*kinds, table]}
     schema.setdefault("$defs", {})
     for table in (schema, *schema["$defs"].values()):
         if table is not schema or scene:
@@ -89,22 +91,10 @@ def _widened(name: str, field: dict[str, Any], table: str, *, scene: bool) -> di
         also.append({"type": "number"})
     if name == "distortion":
         also.append({"type": "array", "minItems": 4, "maxItems": 5, "items": {"type": "number"}})
-    for vector in _vectors(kind):
+    for vector in (option for option in (kind, *kind.get("anyOf", ())) if "prefixItems" in option):
         vector["prefixItems"] = [{"anyOf": [item, _WITH_UNIT]} for item in vector["prefixItems"]]
     return {"anyOf": [*kind.get("anyOf", [kind] if kind else []), *also], **extra} if also else {**kind, **extra}
 
 
 def _takes(field: Mapping[str, Any], kind: str) -> bool:
     return field.get("type") == kind or any(_takes(option, kind) for option in field.get("anyOf", ()))
-
-
-def _vectors(field: Mapping[str, Any]) -> Iterator[dict[str, Any]]:
-    for option in (field, *field.get("anyOf", ())):
-        if isinstance(option, dict) and "prefixItems" in option:
-            yield option
-
-
-def _distribution(table: dict[str, Any]) -> dict[str, Any]:
-    """A number, a list of values, or a table with low and high."""
-    choices = [{"type": kind} for kind in ("number", "string", "boolean", "array")]
-    return {"title": "Distribution", "anyOf": [*choices, {**table, "title": "table"}]}

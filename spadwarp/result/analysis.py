@@ -34,6 +34,17 @@ _CAMERAS = "simulate with camera.polarisation = 'analyser' or 'stokes'"
 _KNOWN = 1.0 / 3.0  # relative standard error of a bin that means something
 
 
+def off_edges(depth: NDArray[Any]) -> tuple[NDArray[np.bool_], float]:
+    """The half of the pixels with a depth `[H, W]` whose neighbours are the nearest to it, on one surface with them;
+    and the median difference of depth among a pixel and its neighbours [m]."""
+    from scipy.ndimage import maximum_filter, minimum_filter
+
+    target, known = np.isfinite(depth), np.nan_to_num(depth, nan=1e9)
+    step = maximum_filter(known, 3) - minimum_filter(known, 3)
+    median = float(np.median(step[target])) if target.any() else 0.0
+    return target & (step <= median), median
+
+
 # Channels of polarised light
 
 

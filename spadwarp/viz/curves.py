@@ -154,12 +154,12 @@ def draw_learning_curves(
     `log`: for each report its `step`, `loss`, `psnr` [dB], a mapping from the backscatter fraction, or from the signal
     photons per pixel (1 and more), to the PSNR there, and `input_psnr`, the mean without a network. `width`: [inch].
     """
-    steps, losses = [line["step"] for line in log], [line["loss"] for line in log]
-    drawn: dict[str, Any] = {"marker": "o", "markersize": 5.0 if len(log) == 1 else 2.0}  # one point has no line
+    steps, losses = [line["step"] for line in log], [line["loss"] for line in log if line["loss"] is not None]
+    drawn: dict[str, Any] = {"marker": "o", "markersize": 5.0 if len(losses) == 1 else 2.0}  # one point has no line
     levels = list(log[-1]["psnr"])
     counted = all(float(level) >= 1 for level in levels)
     figure, (loss, psnr) = panel_grid(2, width, least=3.0, height=2.1)
-    loss.plot(steps, losses, color=BLUE, **drawn)
+    loss.plot(steps[-len(losses) :], losses, color=BLUE, **drawn)
     loss.set(xlabel="step", ylabel="loss")
     if min(losses) > 0:  # "psnr" is a logarithm
         log_axis(loss, "y")

@@ -33,7 +33,7 @@ from spadwarp.result import (
     degree_of_polarisation,
     unclear_pixels,
 )
-from spadwarp.result.analysis import noise_caption, pixel_channel, pixel_standard_error
+from spadwarp.result.analysis import noise_caption, off_edges, pixel_channel, pixel_standard_error
 from spadwarp.scene import Medium, Scene
 from spadwarp.scene.sight import lines_of_sight
 from spadwarp.transport import Spectrum, truth_maps
@@ -179,12 +179,8 @@ def _typical_pixels(
     """Pixels with typical light of the target, off its edges, and of the water, and the one asked for."""
     groups = {"Typical pixel": light > 0}
     if depth is not None:
-        from scipy.ndimage import maximum_filter, minimum_filter
-
-        target, known = np.isfinite(depth) & (light > 0), np.nan_to_num(depth, nan=1e9)
-        step = maximum_filter(known, 3) - minimum_filter(known, 3)
-        off_edges = target & (step <= np.median(step[target]) if target.any() else target)
-        groups = {"Typical pixel of the target": off_edges, "Typical pixel of the water": np.isnan(depth) & (light > 0)}
+        target, _ = off_edges(np.where(light > 0, depth, np.nan))
+        groups = {"Typical pixel of the target": target, "Typical pixel of the water": np.isnan(depth) & (light > 0)}
     found = {name: style.median_pixel(light, group) for name, group in groups.items() if group.any()}
     if pixel is not None:
         for index, name, length in zip(pixel, ("row", "column"), light.shape, strict=True):

@@ -66,13 +66,14 @@ def test_a_short_run_has_the_bound_of_a_long_one(found):
 
 @pytest.mark.slow
 @pytest.mark.physics
-def test_few_photons_leave_the_pulses_of_many_within_their_range():
+@pytest.mark.parametrize(("method", "error"), [("likelihood", 0.05), ("peak", 0.03)])
+def test_few_photons_leave_the_pulses_of_many_within_their_range(method, error):
     """At a pulse energy that pile-up limits, so that noise of the brightest pixels is noise of the pulses."""
-    bright = make(laser={"pulse_energy": 1e-6})
-    many, *few = (proposal(bright, depth_error=0.05, photons=n, seed=n) for n in (1_600_000, 10_000, 40_000, 160_000))
+    bright, photons = make(laser={"pulse_energy": 1e-6}), (1_600_000, 10_000, 40_000, 160_000)
+    many, *few = (proposal(bright, method=method, depth_error=error, photons=n, seed=n) for n in photons)
     assert many.judged and many.pulses_range[1] < 1.5 * many.pulses_range[0]
     for one in few:
-        assert one.pulses_range[0] <= many.pulses_range[1] and many.pulses_range[0] <= one.pulses_range[1]
+        assert one.pulses_range[0] <= many.pulses <= one.pulses_range[1]
 
 
 @pytest.mark.physics
@@ -109,6 +110,19 @@ def test_counts_and_floor_are_those_of_the_whole_simulation(found):
     assert floor > 3 * found.pilot.unscattered_floor["likelihood"]
 
 
+def test_typical_pixels_are_off_edges_and_the_verdict_names_the_surfaces(found):
+    """Of a staircase with an edge on the axis; a plate that is turned has one surface."""
+    scene = spadwarp.load_scene("staircase_5m").with_overrides({"targets[0].translation": [0.0, 0.0, 6.0]})
+    edges = proposal(scene, photons=100_000, depth_error=0.02)
+    assert edges.judged and edges.pilot.surfaces == pytest.approx((5.6, 5.7, 5.9, 6.0), abs=0.01)
+    assert "between depths of 5.6, 5.7, 5.9, 6 m" in _verdict(edges)
+    window = planning.window(scene)
+    depth = spadwarp.truth_maps(window, device="cpu").depth
+    for row, column in np.argwhere(planning.typical_pixels(window, "cpu")):
+        assert np.ptp(depth[max(row - 1, 0) : row + 2, max(column - 1, 0) : column + 2]) < 1e-3
+    assert len(found.pilot.surfaces) == 1 and "Edges" not in _verdict(found)
+
+
 @pytest.mark.slow
 @pytest.mark.physics
 def test_clear_water_leaves_no_floor_and_its_bound_is_that_of_a_gaussian():
@@ -139,9 +153,14 @@ def test_more_error_takes_fewer_pulses_and_the_floor_cannot_be_passed(found):
 
 
 @pytest.mark.slow
-def test_coarse_bins_are_the_limit_of_coarse_bins():
-    coarse = proposal(make(medium={"extinction": 0.05, "albedo": 0.2}, gate={"bin_width_ps": 1000.0}))
-    assert coarse.limit == "bin width" and "bin_width_ps" in coarse.advice and not coarse.reached
+def test_coarse_bins_are_the_limit_of_coarse_bins_wherever_they_begin():
+    """At three places of a plate square to the axis within a bin, which covers 110 mm."""
+    scene = make(medium={"extinction": 0.05, "albedo": 0.2}, gate={"bin_width_ps": 1000.0})
+    plates = ({"translation": [0.0, 0.0, z], "rotation_deg": [0.0, 0.0, 0.0]} for z in (6.0, 6.03, 6.06))
+    found = [proposal(scene.with_overrides({"targets[0]": plate})) for plate in plates]
+    assert all(one.limit == "bin width" and "bin_width_ps" in one.advice and not one.reached for one in found)
+    floors = [one.pilot.floor["likelihood"] for one in found]
+    assert max(floors) < 1.2 * min(floors)
 
 
 @pytest.mark.slow
@@ -204,6 +223,7 @@ def test_ranges_stand_for_an_unknown_target():
         ({"depth_error": "2 ns"}, "depth_error = '2 ns' is a time; a length is needed"),
         ({"ranges": ("3 m", "2 m")}, "least <= largest"),
         ({"depth_error": 0.0}, "depth_error = 0.0"),
+        ({"depth_error": 10}, "depth_error = 10 m is more than the range of the target, 5.93 m; numbers are in m"),
         ({"ranges": 5.0}, "ranges = 5.0 is not of the type tuple"),
         ({"method": "guess"}, "'guess' is not one of"),
         ({"margin": -1.0}, "margin = -1.0"),
@@ -305,19 +325,14 @@ def test_the_safe_distance_in_water_is_that_of_absorption_alone_where_nothing_sc
 # Verdicts: of few photons none, of hopeless water one before a photon is traced
 
 
-def plan(photons, extinction=0.4, **options):
-    scene = Scene.from_dict(SCENE).with_overrides({"medium.extinction": extinction})
-    return spadwarp.plan(scene, photons=photons, device="cpu", largest_range=False, **options)
-
-
 @pytest.mark.slow
 @pytest.mark.parametrize("depth_error", [0.002, 0.3])
 def test_few_photons_say_that_they_do_not_judge_or_judge_as_many_do(depth_error):
-    many = plan(400_000, depth_error=depth_error, seed=9)
+    many = proposal(depth_error=depth_error, seed=9)
     assert many.judged
     for seed in range(2):
         for photons in (1_000, 30_000):
-            few = plan(photons, depth_error=depth_error, seed=seed)
+            few = proposal(photons=photons, depth_error=depth_error, seed=seed)
             assert not few.judged or few.reached == many.reached
             if not few.judged:
                 assert few.photons_needed > few.pilot.photons and "not enough photons to judge" in repr(few)
@@ -346,45 +361,32 @@ def test_a_range_that_is_not_judged_counts_neither_as_reached_nor_as_not(start, 
 
 @pytest.mark.slow
 def test_the_page_shows_verdicts_as_they_are_printed():
-    page = (ROOT / "docs" / "planning.md").read_text(encoding="utf-8")
-    found, terms = plan(20_000), dict.fromkeys(("shot noise", "total"), 0.0)
-    reached = {"reached": True, "pulses_for": "depth error", "pulses_range": (260, 500), "terms": terms}
-    said = [
-        {"pulses": 340, "frame_time": 17.2e-6, "limit": "forward scattering", "terms": terms | {"total": 0.00998}},
-        {
-            "pulses": 18_000,
-            "pulses_range": (15_000, 22_000),
-            "frame_time": 1.8,
-            "limit": "backscatter",
-            "reached": False,
-        },
-        {
-            "pulses": 900,
-            "pulses_range": (890, 910),
-            "pulses_for": "floor",
-            "frame_time": 45e-6,
-            "limit": "bin width",
-            "reached": False,
-        }
-        | {"terms": terms | {"total": 0.161}},
-        {"pulses_for": "not judged", "pilot": dataclasses.replace(found.pilot, photons=3_200_000)}
-        | {"photons_needed": 5.1e7, "seconds_needed": 340.0},
-    ]
-    for changes in said:
-        assert f"- `{_verdict(dataclasses.replace(found, **(reached | changes)))}`" in page
+    page = " ".join((ROOT / "docs" / "planning.md").read_text(encoding="utf-8").split())
+    found, terms = proposal(photons=20_000), dict.fromkeys(("shot noise", "total"), 0.0)
+    edges = dataclasses.replace(found.pilot, surfaces=(4.6, 4.7, 4.9, 5.0))
+    few = dataclasses.replace(found.pilot, photons=3_200_000)
+    found = dataclasses.replace(found, reached=True, pulses_for="depth error", terms=terms, limit="forward scattering")
+    first = {"pulses": 310, "pulses_range": (250, 410), "frame_time": 15.7e-6, "terms": terms | {"total": 0.00998}}
+    long = {"pulses": 18_000, "pulses_range": (15_000, 22_000), "frame_time": 1.8, "limit": "backscatter"}
+    out = {"pulses": 900, "pulses_range": (890, 910), "frame_time": 45e-6, "limit": "bin width", "pulses_for": "floor"}
+    out |= {"terms": terms | {"total": 0.161}}
+    unjudged = {"pulses_for": "not judged", "pilot": few, "photons_needed": 5.1e7, "seconds_needed": 340.0}
+    for changes in (first, long | {"reached": False}, out | {"reached": False}, unjudged):
+        assert f"- `{_verdict(dataclasses.replace(found, **changes))}`" in page
+    assert f"`{_verdict(dataclasses.replace(found, pilot=edges, **first)).partition('. ')[2]}`" in page
 
 
 def test_hopeless_water_is_named_before_a_photon_is_traced(monkeypatch):
     monkeypatch.setattr(planning, "trace", None)
     with pytest.raises(spadwarp.ConfigError, match=r"at 5\.9.* m a pixel detects .* photons at most in all 1e\+05 pul"):
-        plan("auto", extinction=6.0)
+        proposal(make(medium={"extinction": 6.0}), photons="auto")
 
 
 @pytest.mark.slow
 def test_the_bound_before_tracing_is_above_what_is_traced():
     """Light of the target that is traced, of all scatterings, against the bound's 1 in all pulses: it names no water
     in which a pixel detects more."""
-    found = plan(400_000, extinction=1.2)
+    found = proposal(make(medium={"extinction": 1.2}))
     hopeful = found.pilot.target * 1e5
     for time in (1.0 / hopeful, 3.0 / hopeful):
         planning._refuse_hopeless(found.scene, found.target_range[0], time)  # these pulses bring a photon or more

@@ -105,6 +105,7 @@ plan SCENE --depth-error nan | --depth-error
 plan SCENE --range nan:5 | range
 plan SCENE --range 1:10m | '1:10m' is ambiguous: 10m has a unit and 1 has none
 plan SCENE --range 10ns:60ns | is a time; a length is needed
+plan SCENE --depth-error 10 | --depth-error | 10 without a unit is in m; write the unit, such as 10mm or 10m
 plan SCENE --range 3 | FROM:TO
 plan SCENE --range 9m:8m | 9m is more than 8m
 sweep SCENE --vary range=1:10cm:5 | is ambiguous
@@ -118,7 +119,7 @@ sweep SCENE --medium uwoc-cleer | uwoc-clear
 depth DONE --out OUT --input bin_width=5ps | the file has its own bin_width
 depth SCENE --out OUT --input bin_with=5ps | 'bin_with' is not one of bin_width, gate_start, irf
 depth SCENE --out OUT --input image_size=5 | image_size = '5' is not of the form WIDTHxHEIGHT
-denoise SCENE --out OUT --gate 90ns:110ns | group_index
+denoise SCENE --out OUT --gate 110ns:90ns | --gate | 110ns is more than 90ns
 fit SCENE --bounds --unknown absorption --prior reflectance=0.5,0.1 --photons 1000 | targets[0].reflectance is not
 fit SCENE --unknown depth --prior medium.anisotropy=0.9 | is not NAME=MEAN,SD
 """

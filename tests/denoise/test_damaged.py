@@ -6,7 +6,8 @@ import struct
 import pytest
 from safetensors.torch import load_file, save_file
 
-from spadwarp.denoise.network_files import WEIGHTS, compared, weights_metadata
+from spadwarp.denoise.baselines import compared
+from spadwarp.denoise.network_files import WEIGHTS, weights_metadata
 from spadwarp.denoise.networks import load_network
 from spadwarp.values import FileError, SpadwarpError
 

@@ -144,6 +144,8 @@ def test_a_gate_without_any_depth_is_refused(tmp_path):
     path, out = saved(tmp_path, np.full((16, 16), 15.0, np.float32))
     with pytest.raises(ArgumentError, match=r"gate = \(2, 3\) m holds none of the depths of the file, 15 to 15 m"):
         denoise_file(path, out, gate=(2.0, 3.0), model="median")
+    with pytest.raises(ArgumentError, match="a gate in time of flight needs a group index"):
+        denoise_file(path, out, gate_time=(1e-8, 2e-8), model="median")
     assert not out.exists()
     saved(tmp_path, np.full((16, 16), np.nan, np.float32))  # nothing reported: stays empty
     assert np.isnan(denoise_file(path, out, gate=(2.0, 3.0), model="median").depth).all()
@@ -163,6 +165,8 @@ def test_of_histograms_only_the_bins_within_the_gate_count(model, tmp_path, monk
     found = denoise_file(path, out, gate=gate, **options)
     assert found.depth == pytest.approx(150.5 * METRES, abs=0.3 * METRES) and found.gate == gate
     assert [held.values.shape for held in estimated] == [(16, 16, 120)]
+    in_time = denoise_file(path, tmp_path / "time", gate_time=(100 * BIN, 220 * BIN), **options)
+    assert in_time.depth == pytest.approx(found.depth, rel=1e-6) and in_time.gate == pytest.approx(gate)
     for wrong, problem in (((30.0, 32.0), "outside the histograms, 0 to 3.07"), ((1.0, 0.5), "gate = "), (3.0, "gate")):
         with pytest.raises(ArgumentError, match=problem):
             denoise_file(path, out, gate=wrong, **options)
