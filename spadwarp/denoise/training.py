@@ -8,9 +8,11 @@ from __future__ import annotations
 import copy
 import json
 import math
+import os
 import time
 import warnings
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from statistics import fmean
@@ -23,7 +25,6 @@ from torch import Tensor, nn
 
 from spadwarp.denoise.classical import highest, log_likelihood
 from spadwarp.denoise.histogram_network import CLOSE, answer, mean_depth
-from spadwarp.denoise.layers import fixed_order
 from spadwarp.denoise.network_files import torch_device
 from spadwarp.denoise.networks import NETWORKS, load_network
 from spadwarp.denoise.recipe import LEAST_CROP, LEVELS, Noise, Part, TrainingRecipe
@@ -450,6 +451,23 @@ PHOTONS = (1.0, 3.0, 10.0, 30.0, 100.0)
 
 _TIMED = 5  # steps after which the duration is foretold
 _VALIDATION_SEED = 2**40  # of drawn scenes, far from those of training
+
+
+@contextmanager
+def fixed_order() -> Iterator[None]:
+    """Convolutions and products of matrices on a GPU by algorithms that give the same bits each time.
+
+    cuDNN otherwise tries several at the first call and keeps the fastest, which differs from one process to the next.
+    TF32 stays allowed in products.
+    """
+    os.environ.setdefault("CUBLAS_WORKSPACE_CONFIG", ":4096:8")  # read when a process first multiplies matrices
+    cudnn, products = torch.backends.cudnn, torch.backends.cuda.matmul
+    before = cudnn.benchmark, cudnn.deterministic, products.allow_tf32
+    cudnn.benchmark, cudnn.deterministic, products.allow_tf32 = False, True, True
+    try:
+        yield
+    finally:
+        cudnn.benchmark, cudnn.deterministic, products.allow_tf32 = before
 
 
 @fixed_order()
