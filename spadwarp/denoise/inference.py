@@ -132,7 +132,7 @@ def estimate(
 def detected(found: Estimate, given: CountFrames, *, model: str, min_significance: float) -> Estimate:
     """`found` with the significance of the counts, and neither depth nor target below the least; of rates as it is."""
     least, counts = check_real("min_significance", min_significance, "[0, 1000]"), given.counts
-    if counts.dtype.kind not in "biu" and not np.array_equal(counts, np.rint(counts)):
+    if given.are_rates:
         return found
     side = 1 if model == "likelihood" else 7
 
@@ -288,7 +288,11 @@ def estimate_frames(
     if model in FROM_COUNTS:
         raise ArgumentError(f"model = {model!r} needs counts with their background and response; they are missing")
     if model in BASELINES:
-        return _baseline(frames, model, window, weights)
+        if weights is not None:
+            raise ArgumentError(f"weights are for a network, not for {model!r}")
+        filtered = median_filter(frames, window=window) if model == "median" else BASELINES[model](frames)
+        arrays = np.stack([filtered, ~np.isnan(frames.depth), np.full_like(filtered, np.nan)]).astype(np.float32)
+        return Estimate(*_empty_where(frames.depth, arrays))
     torch = require_torch()
     from spadwarp.denoise.networks import corrected_target, load_network, narrowed_input
 
@@ -329,15 +333,6 @@ def estimate_frames(
             raise ArgumentError(f"precision = {kind!r}: the network {model!r} gave values that are not finite")
         return estimate_frames(frames, model=model, weights=weights, device=device, precision="float32")
     return Estimate(*_empty_where(frames.depth, answers.numpy()))
-
-
-def _baseline(frames: DepthFrames, model: str, window: int, weights: str | Path | None) -> Estimate:
-    """`estimate_frames` for one of `BASELINES`."""
-    if weights is not None:
-        raise ArgumentError(f"weights are for a network, not for {model!r}")
-    found = median_filter(frames, window=window) if model == "median" else BASELINES[model](frames)
-    answers = np.stack([found, ~np.isnan(frames.depth), np.full_like(found, np.nan)]).astype(np.float32)
-    return Estimate(*_empty_where(frames.depth, answers))
 
 
 _BY_CHANCE = 6.0  # log of the false second returns that are accepted, one in e^6 pixels
