@@ -88,10 +88,13 @@ def turned(image: NDArray[np.int64], element: int) -> NDArray[np.int64]:
     return np.rot90(np.flip(image, -1) if element >= 4 else image, element % 4, axes=(-2, -1))
 
 
+_TURNED = np.stack([turned(np.arange(9).reshape(3, 3), element) for element in range(GROUP)])  # places, by element
+
+
 @lru_cache(maxsize=32)
 def _expansion(size: int, channels: Literal[1, 8]) -> Tensor:
     """Places in a flat filter `[channels, size, size]` that each of the eight takes, `[8, channels size²]`."""
-    elements = np.stack([turned(np.arange(9).reshape(3, 3), element).ravel() for element in range(GROUP)])
+    elements = _TURNED.reshape(GROUP, -1)
     products = elements[:, elements]  # of each element, after each g
     quotients = (products[:, :, None] == elements).all(axis=-1).argmax(axis=0)  # index of g⁻¹ h for g and h
     places = np.arange(channels * size * size).reshape(channels, size, size)
@@ -214,6 +217,8 @@ _FAR = 10.0  # behind any depth that is reported
 _BORDER = 3  # pixels of padding, more than those of a pair are apart
 _AROUND = tuple((y, x) for y in range(-2, 3) for x in range(-2, 3) if (y, x) != (0, 0))
 _RING = tuple((y, x) for y, x in _AROUND if max(abs(y), abs(x)) == 1)
+# The neighbour beside a pixel, and the one at its corner, turned by each element of `GROUP`.
+_DIRECTIONS = [(int(y) - 1, int(x) - 1) for pixel in (5, 8) for _, y, x in np.argwhere(pixel == _TURNED)]
 _SHARPNESS = 6.0  # a depth with one vote more counts exp(_SHARPNESS) times as much
 
 
@@ -270,7 +275,7 @@ def neighbour_votes(depth: Tensor, reported: Tensor) -> Votes:
     ring = torch.cat(depths, dim=1)
     total = weight.sum(dim=1, keepdim=True)
     voted = torch.where(total > 0.0, (weight * ring).sum(dim=1, keepdim=True) / total.clamp_min(1e-9), 1.0)
-    agreement = torch.cat([single[place] for place in _directions()], dim=1)
+    agreement = torch.cat([single[place] for place in _DIRECTIONS], dim=1)
     return Votes(near, wide, voted, most / 8.0, agreement)
 
 
@@ -280,14 +285,6 @@ def _apart(rows: int, columns: int, device: torch.device) -> Tensor:
     with torch.inference_mode(False):
         row, column = torch.arange(rows, device=device) % 5, torch.arange(columns, device=device) % 5
         return _FAR + 5.0 * row[:, None] + column
-
-
-@lru_cache(maxsize=1)
-def _directions() -> tuple[tuple[int, int], ...]:
-    """The neighbour beside a pixel, and the one at its corner, turned by each element of `GROUP`."""
-    images = [turned(np.arange(9).reshape(3, 3), element) for element in range(GROUP)]
-    places = (np.argwhere(image == pixel)[0] - 1 for pixel in (5, 8) for image in images)
-    return tuple((int(row), int(column)) for row, column in places)
 
 
 class _Residual(nn.Module):

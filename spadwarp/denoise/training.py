@@ -14,6 +14,7 @@ import warnings
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
+from functools import lru_cache
 from pathlib import Path
 from statistics import fmean
 from typing import Any
@@ -30,6 +31,7 @@ from spadwarp.denoise.networks import NETWORKS, load_network
 from spadwarp.denoise.recipe import LEAST_CROP, LEVELS, Noise, Part, TrainingRecipe
 from spadwarp.denoise.synthetic_noise import COUNT_BINS, SUBPIXELS, Batch, CleanScenes, draw_batch, procedural_scenes
 from spadwarp.io.paths import atomic_path
+from spadwarp.io.text import duration
 from spadwarp.parallel import interruptible
 from spadwarp.values import ConfigError, FileError
 
@@ -53,28 +55,21 @@ class Samples:
         self.finer = SUBPIXELS if given is None and self.histograms else 1
         self.parts = recipe.parts()
         self.crop, self.size, self.part, self.bins = 0, 0, self.parts[0], COUNT_BINS[0]
-        # By the side of the crops: scenes with the turn in which they were drawn, those of the step, and held ones.
-        self.drawn: dict[int, tuple[int, CleanScenes]] = {}
+        self.drawn = lru_cache(maxsize=1 + (recipe.optimiser.wide > 0))(self._draw)  # for crops of either side
+        # By the side of the crops: scenes of the step, and held ones.
         self.now: dict[int, CleanScenes] = {}
         self.held: dict[int, CleanScenes] = {}
 
-    def _scenes(self, step: int) -> CleanScenes:
-        if self.given is not None:
-            return self.given
-        settings, side = self.recipe.optimiser, self.crop + 32
-        turn = step // settings.redraw
-        if self.crop not in self.drawn or self.drawn[self.crop][0] != turn:
-            seed = (self.recipe.seed * 1_000_003 + turn) * 4096 % 2**62
-            device = self.generator.device
-            scenes = procedural_scenes(settings.scenes, side, seed=seed, device=device, finer=self.finer)
-            self.drawn[self.crop] = turn, scenes
-        return self.drawn[self.crop][1]
+    def _draw(self, turn: int, crop: int) -> CleanScenes:
+        seed = (self.recipe.seed * 1_000_003 + turn) * 4096 % 2**62
+        count, device = self.recipe.optimiser.scenes, self.generator.device
+        return procedural_scenes(count, crop + 32, seed=seed, device=device, finer=self.finer)
 
     def prepare(self, step: int) -> None:
         settings = self.recipe.optimiser
         scale = 2 if np.random.default_rng((self.recipe.seed, step)).random() < settings.wide else 1
         self.crop, self.size = scale * settings.crop, max(1, settings.batch // scale**2)
-        now = self._scenes(step)
+        now = self.drawn(step // settings.redraw, self.crop) if self.given is None else self.given
         if self.histograms:
             host = np.random.default_rng((self.recipe.seed, 0, step))
             self.part = self.parts[host.choice(len(self.parts), p=[part.share for part in self.parts])]
@@ -532,8 +527,7 @@ def fit(
 def _duration(device: str, seconds: float, steps: int) -> str:
     """How long the rest of a training takes; on a CPU, what to do instead."""
     left = seconds * steps
-    number, unit = (left, "s") if left < 120 else (left / 60, "minutes") if left < 7200 else (left / 3600, "hours")
-    text = f"{steps} step{'s' * (steps != 1)} to go, about {max(number, 1):.0f} {unit}"
+    text = f"{steps} step{'s' * (steps != 1)} to go, about {duration(max(left, 1.0))}"
     if device != "cpu" or left <= 120:
         return text
     return (
