@@ -146,10 +146,7 @@ def safe_distance_in_water(
     result = simulate(traced, photons=photons, seed=seed, device=device)
     exposed = [result.flux[disc["name"]]["irradiance"] for disc in discs]
     share = np.array([one.values[0, 0] + 2.0 * (0.0 if one.errors is None else one.errors[0, 0]) for one in exposed])
-    beyond = np.flatnonzero(share * _AREA > allowed)
-    if beyond.size == 0:
-        return float(distances[0])
-    last = int(beyond[-1])
+    last = max(np.flatnonzero(share * _AREA > allowed), default=-1)
     return float(distances[min(last + 1, _PLANES - 1)])
 
 

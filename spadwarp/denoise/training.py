@@ -325,18 +325,13 @@ class Run:
             for name, part in self.state.items():
                 part.load_state_dict(kept[name])
             self.generator.set_state(kept["random"])
-            kept = {**kept, "step": int(kept["step"]), "seconds": float(kept["seconds"])}
+            step, spent, log = int(kept["step"]), float(kept["seconds"]), str(kept["log"])
+            self.loss_sum += float(kept["loss_sum"])
         except (LookupError, TypeError, ValueError, AttributeError, RuntimeError) as error:
             raise FileError(f"{self.checkpoint}: not whole; remove it to start anew: {error}") from error
-        if self.log.is_file():  # a line is written before its checkpoint
-            settings = self.recipe.optimiser
-            done = kept["step"] / settings.interval  # the first line is that of step 0
-            reports = 1 + (math.ceil if kept["step"] == settings.steps else math.floor)(done)
-            lines = self.log.read_text(errors="replace").splitlines(keepends=True)[:reports]
-            with atomic_path(self.log) as temporary:
-                temporary.write_text("".join(lines))
-        self.loss_sum += kept.get("loss_sum", 0.0)
-        return int(kept["step"]), float(kept["seconds"])
+        with atomic_path(self.log) as temporary:  # without a line that was written after the checkpoint
+            temporary.write_text(log)
+        return step, spent
 
     def report(self, psnr: dict[float, float], input_psnr: float) -> None:
         """Writes a line of the log and a checkpoint."""
@@ -416,6 +411,7 @@ class Run:
         kept = {name: part.state_dict() for name, part in self.state.items()}
         kept.update(recipe=self.recipe.model_dump_json(), random=self.generator.get_state(), step=self.step)
         kept.update(loss_sum=float(self.loss_sum), seconds=time.monotonic() - self.began)
+        kept["log"] = self.log.read_text() if self.log.is_file() else ""
         with atomic_path(self.checkpoint) as temporary:
             torch.save(kept, temporary)
 
