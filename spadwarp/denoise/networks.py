@@ -187,9 +187,7 @@ class USDN(nn.Module):
         features = torch.cat([scale(features) for scale in self.scales], dim=1)
         features = F.max_pool2d(features, 7, stride=1, padding=3)
         depth = self.last(edge_padded(features, 3)[..., 1:, 1:])
-        if not self.training:  # while it learns, values beyond the bounds must have a slope
-            depth = depth.clamp(0.0, 1.0)
-        return depth
+        return depth if self.training else depth.clamp(0.0, 1.0)  # what learns has a slope beyond the bounds, too
 
 
 class DnCNN(nn.Module):
