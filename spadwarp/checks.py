@@ -123,11 +123,12 @@ class Survey:
         """Adds a note."""
         self.messages.append(CheckMessage("note", field, text, values))
 
-    def illuminated_part(self, triangles: Points) -> Points:
-        """Points of triangles in the view and the beam, `[N, 3]`; behind ports, of those that planes in air hold."""
+    def illuminated_part(self, triangles: Points, sides: int = 2) -> Points:
+        """Points of triangles in the view and the beam, or in the first of these `sides`, `[N, 3]`; behind ports, of
+        those that planes in air hold."""
         has_port = self.camera_port is not None or self.laser_port is not None
         whole = [np.array([[0.0, 0.0, 1.0, 0.0]])] if has_port else []
-        for planes, port, axis, _ in self._sides:
+        for planes, port, axis, _ in self._sides[:sides]:
             # Bent towards its normal, light stays within the planes in air, but about a tilted port.
             if port is None or port.shape == "dome" or np.dot(port.normal, axis) > 0.999:
                 whole.append(planes)
@@ -136,7 +137,7 @@ class Survey:
             start, direction = self._rays()
             hits = start + first_hits(triangles, start, direction, self.device)[:, None] * direction
             points = np.concatenate([points, hits[np.isfinite(hits).all(axis=1)]])
-        for planes, port, _, origin in self._sides:
+        for planes, port, _, origin in self._sides[:sides]:
             if port is not None and len(points):
                 ahead = origin + port.connect(points, origin)[0]
                 points = points[(ahead @ planes[:, :3].T + planes[:, 3] >= 0.0).all(axis=1)]
@@ -407,12 +408,11 @@ def _check_target(survey: Survey, name: str, triangles: Points) -> None:
         return survey.warn(name, text, half_width=wide, half_height=tall, depth=depth)
     if (nearest := float(np.linalg.norm(in_view, axis=1).min())) <= scene.camera.aperture_radius:
         return survey.warn(name, f"reaches the lens ({where}): translation moves it away", nearest=nearest)
-    angles = _angles(survey, survey.visible(in_view))
+    seen = survey.illuminated_part(triangles, sides=1)  # through the port
+    angles = _angles(survey, survey.visible(seen if len(seen) else in_view))
     if not len(illuminated):
-        text = (
-            f"the beam misses what the camera sees of it: {where}, that is {angles.min():.3g} to {angles.max():.3g}° "
-        )
-        text += f"off the axis, {_beam_text(scene.laser)}"
+        text = f"the beam misses what the camera sees of it: {where}, that is {angles.min():.3g} to "
+        text += f"{angles.max():.3g}° off the axis, {_beam_text(scene.laser)}"
         return survey.warn(name, text, nearest_angle_deg=float(angles.min()))
     widest = float(angles.max())
     cone = laser.profile in ("uniform_cone", "gaussian") and scene.scan_positions == 1 and laser.half_angle_deg < 90.0

@@ -119,6 +119,9 @@ def test_a_target_that_the_beam_misses(profile):
     assert "half angle is 2°" in message.text
     mostly = find(checked(plate(5.0, 1.4), **NARROW, laser__profile=profile), "laser.half_angle_deg", "note")
     assert "misses most" in mostly.text and mostly.values["widest_angle_deg"] == pytest.approx(11.2, abs=0.5)
+    # Through the sea, 15° beside the vertical, light goes another way than straight: the view reaches 0.028°.
+    notes = [(one.field, one.level) for one in check(load_scene("aircraft_1km", {"laser.profile": profile}))]
+    assert ("laser.half_angle_deg", "note") not in notes
 
 
 def test_a_pencil_beam_hits_what_lies_on_its_line_only():
