@@ -428,17 +428,13 @@ def _check_target(survey: Survey, name: str, triangles: Points) -> None:
     corners, bounds = to_world(scene.camera, corners), scene.domain.bounds
     low, high = corners.min(axis=0), corners.max(axis=0)
     if (low < bounds[0]).any() or (high > bounds[1]).any():
-        text = (
-            f"spans {_vector(low)} to {_vector(high)} m in the world; the water reaches from {_vector(bounds[0])} to "
-            f"{_vector(bounds[1])} m: nothing outside is hit"
-        )
+        text = f"spans {_vector(low)} to {_vector(high)} m in the world; the water reaches from "
+        text += f"{_vector(bounds[0])} to {_vector(bounds[1])} m: nothing outside is hit"
         survey.warn(name, text)
     extent = np.ptp(image_points(scene.camera, in_view[:, :2] / in_view[:, 2:]), axis=0)
     if extent.max() < 1.0:
-        text = (
-            f"smaller than a pixel, {extent[0]:.2g} x {extent[1]:.2g} of one: the truth maps may miss it, and what is "
-            "beside it shares its pixel"
-        )
+        text = f"smaller than a pixel, {extent[0]:.2g} x {extent[1]:.2g} of one: the truth maps may miss it, and "
+        text += "what is beside it shares its pixel"
         survey.warn(name, text, columns=float(extent[0]), rows=float(extent[1]))
 
 
@@ -513,11 +509,15 @@ def _check_ports(survey: Survey) -> None:
             text = f"through it the camera sees {wide:.3g} x {tall:.3g}° of the water; intrinsics are those in air"
             survey.note("camera.port", text, wide_deg=wide, tall_deg=tall)
     if survey.laser_port is not None and scene.scan_positions == 1:
-        (start, along), distance = survey.beam_axis, survey.distance
+        (start, along), distance, origin = survey.beam_axis, survey.distance, np.array(scene.beam.position)
         point, bend = start + distance * along, math.degrees(math.acos(min(float(along @ scene.beam.axis), 1.0)))
         ahead = point / np.linalg.norm(point) if port is None else port.connect(point, np.zeros(3))[0]
         inside = (survey.view[:, :3] / np.linalg.norm(survey.view[:, :3], axis=1, keepdims=True)) @ ahead
-        if (beside := -math.degrees(math.asin(inside.min()))) > 0.0 and bend > 0.1:
+        # Not of a beam that is turned out of the view, nor of one that still lights the middle of the view.
+        turned = (survey.view[:, :3] @ (origin + distance * np.array(scene.beam.axis)) < 0.0).any()
+        middle = origin + survey.laser_port.connect([0.0, 0.0, distance], origin)[0]
+        lit = (survey.beam[:, :3] @ middle + survey.beam[:, 3] >= 0.0).all()
+        if (beside := -math.degrees(math.asin(inside.min()))) > 0.0 and not (turned or lit):
             text = f"bends the beam by {bend:.3g}°: at {distance:.4g} m its axis is {beside:.3g}° beside the view, "
             text += f"{_beam_text(scene.laser)}; none is bent in the centre of a dome"
             survey.warn("laser.port", text, bend_deg=bend, beside_deg=beside)
