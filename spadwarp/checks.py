@@ -123,11 +123,12 @@ class Survey:
         """Adds a note."""
         self.messages.append(CheckMessage("note", field, text, values))
 
-    def illuminated_part(self, triangles: Points) -> Points:
-        """Points of triangles in the view and the beam, `[N, 3]`; behind ports, of those that planes in air hold."""
+    def illuminated_part(self, triangles: Points, sides: int = 2) -> Points:
+        """Points of triangles in the view and the beam, or in the first of these `sides`, `[N, 3]`; behind ports, of
+        those that planes in air hold."""
         has_port = self.camera_port is not None or self.laser_port is not None
         whole = [np.array([[0.0, 0.0, 1.0, 0.0]])] if has_port else []
-        for planes, port, axis, _ in self._sides:
+        for planes, port, axis, _ in self._sides[:sides]:
             # Bent towards its normal, light stays within the planes in air, but about a tilted port.
             if port is None or port.shape == "dome" or np.dot(port.normal, axis) > 0.999:
                 whole.append(planes)
@@ -136,7 +137,7 @@ class Survey:
             start, direction = self._rays()
             hits = start + first_hits(triangles, start, direction, self.device)[:, None] * direction
             points = np.concatenate([points, hits[np.isfinite(hits).all(axis=1)]])
-        for planes, port, _, origin in self._sides:
+        for planes, port, _, origin in self._sides[:sides]:
             if port is not None and len(points):
                 ahead = origin + port.connect(points, origin)[0]
                 points = points[(ahead @ planes[:, :3].T + planes[:, 3] >= 0.0).all(axis=1)]
@@ -407,12 +408,11 @@ def _check_target(survey: Survey, name: str, triangles: Points) -> None:
         return survey.warn(name, text, half_width=wide, half_height=tall, depth=depth)
     if (nearest := float(np.linalg.norm(in_view, axis=1).min())) <= scene.camera.aperture_radius:
         return survey.warn(name, f"reaches the lens ({where}): translation moves it away", nearest=nearest)
-    angles = _angles(survey, survey.visible(in_view))
+    seen = survey.illuminated_part(triangles, sides=1)  # through the port
+    angles = _angles(survey, survey.visible(seen if len(seen) else in_view))
     if not len(illuminated):
-        text = (
-            f"the beam misses what the camera sees of it: {where}, that is {angles.min():.3g} to {angles.max():.3g}° "
-        )
-        text += f"off the axis, {_beam_text(scene.laser)}"
+        text = f"the beam misses what the camera sees of it: {where}, that is {angles.min():.3g} to "
+        text += f"{angles.max():.3g}° off the axis, {_beam_text(scene.laser)}"
         return survey.warn(name, text, nearest_angle_deg=float(angles.min()))
     widest = float(angles.max())
     cone = laser.profile in ("uniform_cone", "gaussian") and scene.scan_positions == 1 and laser.half_angle_deg < 90.0
@@ -428,17 +428,13 @@ def _check_target(survey: Survey, name: str, triangles: Points) -> None:
     corners, bounds = to_world(scene.camera, corners), scene.domain.bounds
     low, high = corners.min(axis=0), corners.max(axis=0)
     if (low < bounds[0]).any() or (high > bounds[1]).any():
-        text = (
-            f"spans {_vector(low)} to {_vector(high)} m in the world; the water reaches from {_vector(bounds[0])} to "
-            f"{_vector(bounds[1])} m: nothing outside is hit"
-        )
+        text = f"spans {_vector(low)} to {_vector(high)} m in the world; the water reaches from "
+        text += f"{_vector(bounds[0])} to {_vector(bounds[1])} m: nothing outside is hit"
         survey.warn(name, text)
     extent = np.ptp(image_points(scene.camera, in_view[:, :2] / in_view[:, 2:]), axis=0)
     if extent.max() < 1.0:
-        text = (
-            f"smaller than a pixel, {extent[0]:.2g} x {extent[1]:.2g} of one: the truth maps may miss it, and what is "
-            "beside it shares its pixel"
-        )
+        text = f"smaller than a pixel, {extent[0]:.2g} x {extent[1]:.2g} of one: the truth maps may miss it, and "
+        text += "what is beside it shares its pixel"
         survey.warn(name, text, columns=float(extent[0]), rows=float(extent[1]))
 
 
@@ -513,11 +509,15 @@ def _check_ports(survey: Survey) -> None:
             text = f"through it the camera sees {wide:.3g} x {tall:.3g}° of the water; intrinsics are those in air"
             survey.note("camera.port", text, wide_deg=wide, tall_deg=tall)
     if survey.laser_port is not None and scene.scan_positions == 1:
-        (start, along), distance = survey.beam_axis, survey.distance
+        (start, along), distance, origin = survey.beam_axis, survey.distance, np.array(scene.beam.position)
         point, bend = start + distance * along, math.degrees(math.acos(min(float(along @ scene.beam.axis), 1.0)))
         ahead = point / np.linalg.norm(point) if port is None else port.connect(point, np.zeros(3))[0]
         inside = (survey.view[:, :3] / np.linalg.norm(survey.view[:, :3], axis=1, keepdims=True)) @ ahead
-        if (beside := -math.degrees(math.asin(inside.min()))) > 0.0 and bend > 0.1:
+        # Not of a beam that is turned out of the view, nor of one that still lights the middle of the view.
+        turned = (survey.view[:, :3] @ (origin + distance * np.array(scene.beam.axis)) < 0.0).any()
+        middle = origin + survey.laser_port.connect([0.0, 0.0, distance], origin)[0]
+        lit = (survey.beam[:, :3] @ middle + survey.beam[:, 3] >= 0.0).all()
+        if (beside := -math.degrees(math.asin(inside.min()))) > 0.0 and not (turned or lit):
             text = f"bends the beam by {bend:.3g}°: at {distance:.4g} m its axis is {beside:.3g}° beside the view, "
             text += f"{_beam_text(scene.laser)}; none is bent in the centre of a dome"
             survey.warn("laser.port", text, bend_deg=bend, beside_deg=beside)

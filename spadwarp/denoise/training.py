@@ -287,8 +287,8 @@ class Run:
         if not self.counting:
             self.network = self.network.to(memory_format=torch.channels_last)
         self.average = copy.deepcopy(self.network).requires_grad_(False)
-        rate, decay = recipe.optimiser.learning_rate, recipe.optimiser.weight_decay
-        common: dict[str, Any] = {"lr": torch.tensor(rate, device=device) if is_cuda else rate, "weight_decay": decay}
+        self.rate = torch.zeros((), device=device)  # which recorded steps read
+        common: dict[str, Any] = {"lr": self.rate if is_cuda else 0.0, "weight_decay": recipe.optimiser.weight_decay}
         matrices, others = ([p for p in network.parameters() if _is_matrix(p) == one] for one in (True, False))
         self.optimisers = (
             Muon(matrices, common),
@@ -355,7 +355,7 @@ class Run:
         """One step, whose samples are prepared. On a GPU steps are replayed as a CUDA graph: launched faster."""
         rate = _learning_rate(self.step, self.recipe)
         for group in (group for one in self.optimisers for group in one.param_groups):
-            group["lr"] = group["lr"].fill_(rate) if isinstance(group["lr"], Tensor) else rate
+            group["lr"] = self.rate.fill_(rate) if self.side is not None else rate  # that of a checkpoint is a copy
         kind = self.samples.kind
         if recorded := self.graphs.get(kind):
             graph, loss = recorded

@@ -131,11 +131,11 @@ def write_spectrum(spectrum: Spectrum, out: str | Path, *, device: str | None = 
     wavelength, and spectrum.png; returns the paths.
 
     Of the lines of the laser's spectrum also the files of `write_run` of their sum, in the same directory; of
-    wavelengths of one's own, or lines that were interrupted, those of each, in directories such as `532nm`. Raises
+    wavelengths of one's own, or with flux, or after an interrupt those of each, in directories such as `532nm`. Raises
     `FileError`.
     """
     written, folder = list[Path](), Path(out)
-    if spectrum.scene.laser.wavelengths_nm == "spectrum" and not spectrum.partial:
+    if spectrum.scene.laser.wavelengths_nm == "spectrum" and not (spectrum.partial or spectrum.scene.flux):
         written += write_run(spectrum.combined(), folder, device=device).written
         depth = {line: one.depth(device=device) for line, one in spectrum.results.items()}
     else:

@@ -172,7 +172,7 @@ def _opening(seen: NDArray[np.float64], expected: NDArray[np.float64]) -> NDArra
 def _falling(
     seen: NDArray[np.float64], exposure: NDArray[np.float64], level: NDArray[np.float64], pixels: float
 ) -> NDArray[np.float64]:
-    """Any falling course where by it the counts are clearly more likely than by decays: walls end the water.
+    """Any falling course, where walls end the water: less than half of what decays expect is clearly more likely there.
 
     Isotonic regression of the counts; linear between the bins that returns leave free.
     """
@@ -183,9 +183,9 @@ def _falling(
         return level
     part = seen[free] / exposure[free]
     found = np.maximum(isotonic_regression(part, weights=exposure[free], increasing=False).x, 1e-9)
-    gain = (seen[free] * np.log(found / level[free])).sum() - ((found - level[free]) * exposure[free]).sum()
-    levels = len(np.unique(found))
-    if gain < levels * np.log(len(free)):
+    less = found < 0.5 * level[free]
+    gain = seen[free] * np.log(found / level[free]) - (found - level[free]) * exposure[free]
+    if gain[less].sum() < len(np.unique(found[less])) * np.log(len(free)) + _FALSE:
         return level
     return np.interp(np.arange(level.size), free, found)
 

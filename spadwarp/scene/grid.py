@@ -307,7 +307,7 @@ class GridCells:
     def index_of(self, places: Floats) -> tuple[tuple[Any, ...], Any]:
         """Indices of the cells at places of `in_cells`, outside the box of the nearest, and whether they are in it."""
         shape = np.array(self.extinction.shape)
-        index = np.clip(np.floor(places), -1, shape).astype(np.int32)
+        index = np.clip(np.nan_to_num(np.floor(places), nan=-1.0), -1, shape).astype(np.int32)
         inside = ((index >= 0) & (index < shape)).all(axis=-1)
         return tuple(np.moveaxis(np.clip(index, 0, shape - 1), -1, 0)), inside
 

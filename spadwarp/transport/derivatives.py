@@ -193,10 +193,8 @@ def _block_shape(scene: Scene, blocks: Any) -> tuple[int, ...]:
     for edge, (count, along) in enumerate(zip(blocks, grid_cells(scene.medium).extinction.shape, strict=True)):
         if count < 1 or along % count:
             possible = ", ".join(str(n) for n in range(1, along + 1) if along % n == 0)
-            text = (
-                f"{count} does not divide the {along} cells along {'xyz'[edge]} of medium.grid; possible are {possible}"
-            )
-            raise ConfigError(f"blocks[{edge}] = {text}", source=scene.source)
+            text = f"blocks[{edge}] = {count} does not divide the {along} cells along {'xyz'[edge]} of medium.grid"
+            raise ConfigError(f"{text}; possible are {possible}", source=scene.source)
     return tuple(map(int, blocks))
 
 

@@ -640,9 +640,8 @@ def _check_size(scene: Scene, model: sk.Model, copies: float, signed: int) -> bo
     needed = ((8 if cuda else 16) * size * (1 + signed) + 36 * model.flux.size) * copies / 2**30
     available = model.device.free_memory if cuda else physical_memory()
     if available is not None and needed > available / 2**30:
-        raise DeviceError(
-            f"{shape} need {needed:.1f} GiB on {model.device.alias}; {available / 2**30:.1f} GiB are available"
-        )
+        free = f"{available / 2**30:.1f} GiB are available"
+        raise DeviceError(f"{shape} need {needed:.1f} GiB on {model.device.alias}; {free}")
     return available is None or 1.5 * needed <= available / 2**30
 
 

@@ -164,6 +164,7 @@ def simulate(
         workers: LocalWorkers | ClusterWorkers
         if engine is None:
             workers = LocalWorkers(plan, devices, threads=run.threads, tallies=tallies, mesh_cache=mesh_cache)
+            stack.callback(workers.pool.shutdown, wait=False)
         else:
             note = None if progress is None else lambda text: progress(text, 0, 0)
             workers = stack.enter_context(ClusterWorkers(plan, engine, device, note=note))

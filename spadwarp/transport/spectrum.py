@@ -62,8 +62,10 @@ class Spectrum:
         all that takes a result (eq 7 of the paper by Monte Carlo).
 
         It has no standard errors: those of runs with the same photons are not independent. Raises `ConfigError` where
-        the wavelengths are others than those of the spectrum, or the runs were interrupted.
+        the wavelengths are others than those of the spectrum, the runs were interrupted, or there is flux.
         """
+        if self.scene.flux:
+            raise ConfigError("flux is not summed over the lines of a spectrum; each of `results` has its own")
         if self.partial:
             raise ConfigError("laser.spectrum: the runs were interrupted, so that lines lack photons")
         lines = spectral_lines(self.scene.laser, self.scene.detector)

@@ -356,10 +356,10 @@ def prepare_kernels(
 
 
 class LocalWorkers:
-    """Workers of this process, one a device, each with a thread of Python for the length of a block.
+    """Workers of this process, one a device, each with a thread of Python.
 
     A worker's first block, of `first_block` photons, shows how fast it is; `must_rest`: `tallies` changes while any
-    traces. `threads` are those of the CPU in all, by default one a core; a GPU takes one.
+    traces. `threads` are those of the CPU in all, by default one a core; a GPU takes one. Callers shut `pool` down.
 
     Raises `ConfigError`: CPU and GPU together, caller's tallies with several devices, or a number out of range;
     `DeviceError`: a device failed, or has too little memory.
@@ -408,14 +408,12 @@ class LocalWorkers:
         self.timing = {"setup": built - began, "compile": time.perf_counter() - traced, "truth": traced - built}
         self.first_block = threads * size
         self._devices, self._stopped = devices, threading.Event()
-        self._pool, self._pending = ThreadPoolExecutor(len(devices)), dict[Future[Any], Worker]()
+        self.pool, self._pending = ThreadPoolExecutor(len(devices)), dict[Future[Any], Worker]()
         self._reported: queue.SimpleQueue[Event] = queue.SimpleQueue()
         self.workers = [Worker(device.alias, threads, self._stopped) for device in devices]
         for worker, tracer in zip(self.workers, self.tracers, strict=True):
-            worker.state |= {
-                "tracer": tracer,
-                "report": lambda n, who=worker: self._reported.put(Event("progress", who, n)),
-            }
+            worker.state["tracer"] = tracer
+            worker.state["report"] = lambda n, who=worker: self._reported.put(Event("progress", who, n))
 
     @property
     def idle(self) -> list[Worker]:
@@ -424,7 +422,7 @@ class LocalWorkers:
 
     def send(self, worker: Worker, work: Callable[..., Any], *arguments: Any) -> None:
         """Lets an idle worker run `work(*arguments, worker)`."""
-        self._pending[self._pool.submit(work, *arguments, worker)] = worker
+        self._pending[self.pool.submit(work, *arguments, worker)] = worker
 
     def collect(self, worker: Worker) -> None:
         """Tallies stay where they are: `tallies` adds them up when all workers rest."""

@@ -54,7 +54,7 @@ NARROW = {"laser__half_angle_deg": 2.0}
 
 
 def test_a_beam_that_a_dome_bends_beside_the_view_is_named():
-    """n r sin θ stays the same through a sphere (Bouguer); a pencil of light that is bent within the view is none."""
+    """n r sin θ stays the same through a sphere (Bouguer); not one that stays in view, nor one that fills the view."""
     dome = {"shape": "dome", "radius": 0.08, "thickness": 0.006, "index": 1.5}
     behind = {"camera__port": dome, "laser__port": "camera", "medium__phase_index": 1.34, **NARROW}
     message = find(checked(plate(5.0, side=8.0), **behind, laser__position=[-0.05, 0, 0]), "laser.port")
@@ -63,6 +63,8 @@ def test_a_beam_that_a_dome_bends_beside_the_view_is_named():
     assert message.values["bend_deg"] == pytest.approx(bend, rel=1e-3)
     assert message.values["beside_deg"] == pytest.approx(bend - 10.0, abs=0.7)  # starts 5 cm beside, 0.6°
     assert not warnings(checked(plate(5.0, side=8.0), **behind, **PENCIL, laser__position=[-0.02, 0, 0]))
+    wide = behind | {"laser__half_angle_deg": 30.0}
+    assert not warnings(checked(plate(5.0, side=8.0), **wide, laser__position=[-0.05, 0, 0]))
 
 
 @pytest.mark.parametrize(
@@ -119,6 +121,9 @@ def test_a_target_that_the_beam_misses(profile):
     assert "half angle is 2°" in message.text
     mostly = find(checked(plate(5.0, 1.4), **NARROW, laser__profile=profile), "laser.half_angle_deg", "note")
     assert "misses most" in mostly.text and mostly.values["widest_angle_deg"] == pytest.approx(11.2, abs=0.5)
+    # Through the sea, 15° beside the vertical, light goes another way than straight: the view reaches 0.028°.
+    notes = [(one.field, one.level) for one in check(load_scene("aircraft_1km", {"laser.profile": profile}))]
+    assert ("laser.half_angle_deg", "note") not in notes
 
 
 def test_a_pencil_beam_hits_what_lies_on_its_line_only():

@@ -127,6 +127,7 @@ def test_optical_depths_through_a_cloud():
         assert found == pytest.approx(expected, rel=2e-3)
     assert one.optical_depth((5.0, 0.0, 0.0), (5.0, 0.0, 3.0)) == pytest.approx(1.5)
     assert one.optical_depth(near, (0.0, 0.0, 1e30)) == pytest.approx(0.5e30)
+    assert np.isnan(one.optical_depth(near, np.full(3, np.nan)))  # of a pixel that sees no target, without a warning
 
 
 def test_files_are_found_beside_the_scene_and_overrides_reach_a_grid(tmp_path):

@@ -4,6 +4,7 @@ import dataclasses
 import itertools
 import math
 import signal
+import threading
 import warnings
 from functools import partial
 
@@ -54,7 +55,7 @@ GPUS = ["cuda:0,cuda:0", "cuda:all"] if "cuda:0" in DEVICES else []
 
 @pytest.mark.parametrize("device", ["cpu,cpu", *GPUS])
 def test_devices_with_tallies_of_their_own_add_up_to_one(device, whole):
-    options, seen = {**RUN}, []
+    options, seen, threads = {**RUN}, [], {*threading.enumerate()}
     one = simulate(scene(), **options, device="cuda:0") if device.startswith("cuda") else whole
     run = {"device": device, "run": RunOptions(threads=4, launch_size=3000)}
     cut = simulate(scene(), **options, **run, progress=lambda *report: seen.append(report))
@@ -62,6 +63,9 @@ def test_devices_with_tallies_of_their_own_add_up_to_one(device, whole):
     assert cut.provenance["device"] == device or device == "cuda:all"
     traced = [done for stage, done, _ in seen if stage == "trace"]
     assert seen[0][0] == "compile" and traced == sorted(traced) and traced[-1] == cut.photons
+    for thread in {*threading.enumerate()} - threads:  # none waits for more
+        thread.join(30.0)
+        assert not thread.is_alive()
 
 
 @pytest.mark.parametrize("other", sorted({"cpu", *DEVICES}))

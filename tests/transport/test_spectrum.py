@@ -1,5 +1,6 @@
 """Runs at several wavelengths with the same photons, and their sum over a spectrum."""
 
+import dataclasses
 import math
 
 import h5py
@@ -65,6 +66,9 @@ def test_the_sum_over_the_spectrum_is_that_of_its_lines(device):
     np.testing.assert_allclose(combined.histogram * passed, expected, rtol=1e-4, atol=1e-4 * expected.max())
     expected = sum(line.share * found.results[line.wavelength_nm].channels["cross"] for line in lines)
     np.testing.assert_allclose(combined.channels["cross"] * passed, expected, rtol=1e-4, atol=1e-4 * expected.max())
+    flux = {"flux": [{"name": "a", "positions": [1.0]}], "transport.estimator": "next_event"}
+    with pytest.raises(ConfigError, match="flux is not summed over the lines"):
+        dataclasses.replace(found, scene=broad().with_overrides(flux)).combined()
     # In 4 nm water hardly changes, and what is left of the noise is shared.
     alone = spadwarp.simulate(broad(linewidth_nm=0.0), photons=2_000, device=device)
     assert combined.histogram.sum() == pytest.approx(alone.histogram.sum(), rel=5e-3)
