@@ -126,7 +126,7 @@ LINES = {
     "parallel": (600, 566),
     "result": (1500, 2147),
     "scene": (3700, 5059),
-    "transport": (2300, 3333),
+    "transport": (2300, 3331),
     "validate": (750, 794),
     "viz": (2200, 2553),
     "water": (800, 852),
