@@ -295,7 +295,7 @@ def _returns(
         side = min(width * times, bins) | 1
         rest = np.where(found, expected, blocks)  # without what a narrower window found
         counts, level = (side * uniform_filter1d(one, side, axis=1, mode="constant") for one in (rest, expected))
-        level += 1e-9
+        level = np.maximum(level, 1e-9)  # sums that run along the bins can end a little below 0
         ratio = counts * np.log(np.maximum(counts, 1e-9) / level) - (counts - level)
         excess = (counts > level) & (ratio > np.log(bins) + _FALSE)
         found |= maximum_filter1d(excess, side + (width - 1) * (times == 1), axis=1, mode="constant")
