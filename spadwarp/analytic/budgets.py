@@ -7,7 +7,7 @@ left out, which in turbid water is most of the backscatter.
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass
 from typing import Any
 
@@ -117,7 +117,7 @@ def central_pixel(scene: Scene, truth: Truth) -> tuple[Any, ...]:
 
 def axis_rows(
     scene: Scene, name: str | None, distances: Floats, reflectance: float, device: str | None
-) -> list[BudgetRow]:
+) -> Iterator[BudgetRow]:
     """A row for each distance on the optical axis [m], for the scene's water of that name."""
     gate = (scene.gate.start, scene.gate.stop)
     line, length = axis_line(scene), gate[1] - gate[0]
@@ -129,7 +129,6 @@ def axis_rows(
     chosen, pulses = scene.analytic, float(scene.pulses_per_depth_frame)
     if chosen.count_law != "per_pulse":
         pulses = chosen.frames * chosen.exposure * scene.laser.repetition_rate
-    rows: list[BudgetRow] = []
     for (start, stop), inside in gates:
         maps, _ = pixel_maps(
             scene,
@@ -147,7 +146,7 @@ def axis_rows(
             start_point = line.start[0].tolist()
             depths = np.array([scene.optical_depth(start_point, line.points([x])[0].tolist()) for x in inside])
         for i, (distance, depth) in enumerate(zip(inside, depths, strict=True)):
-            row = BudgetRow(
+            yield BudgetRow(
                 medium=name or scene.medium.preset or "scene",
                 extinction=scene.medium.extinction,
                 range=float(distance),
@@ -160,15 +159,14 @@ def axis_rows(
                 pulses_for_1cm=float(needed[i]),
                 **{field: float(maps[field][i]) for field in _FROM_MAPS},
             )
-            rows.append(row)
-    return rows
 
 
 def central_row(scene: Scene, device: str | None) -> BudgetRow:
     warn_of_model(scene, stacklevel=4)
     truth = truth_maps(scene)
     pixel = central_pixel(scene, truth)
-    return axis_rows(scene, None, np.array([float(truth.range[pixel])]), float(truth.reflectance[pixel]), device)[0]
+    distances, reflectance = np.array([float(truth.range[pixel])]), float(truth.reflectance[pixel])
+    return next(axis_rows(scene, None, distances, reflectance, device))
 
 
 def _distances(scene: Scene, ranges: Any) -> Floats:

@@ -100,9 +100,7 @@ def eye_limit(of: Laser | Scene, *, distance: float = 0.1, exposure: float = 100
         return _share(laser, bare, densest) <= allowed
 
     hazard = math.inf
-    if is_within(0.0):
-        hazard = 0.0
-    elif is_within(_FARTHEST):
+    if is_within(_FARTHEST):
         hazard = bare = _first(is_within, _FARTHEST)
         if as_if_bare(of, bare) != bare:  # behind a port
             hazard = _first(lambda other: as_if_bare(of, other) >= bare, 1e9)
@@ -130,8 +128,8 @@ def safe_distance_in_water(
     allowed = _pulse_limit(laser, exposure)[0] * _AREA / laser.pulse_energy
     lost = scene.medium.range.absorption
     farthest = min(found.hazard_distance, -math.log(allowed) / lost if lost > 0.0 and allowed < 1.0 else math.inf)
-    if farthest == 0.0 or farthest > _FARTHEST:
-        return farthest if farthest == 0.0 else math.inf
+    if not 0.0 < farthest <= _FARTHEST:
+        return math.inf if farthest else 0.0
     start, axis = to_world(scene.camera, beam.position), rotation_matrix(scene.camera.rotation_deg) @ beam.axis
     distances = np.geomspace(1e-3 * farthest, farthest, _PLANES)
     spot = 0.0 if beam.profile == "collimated" else 0.05 * math.tan(min(beam.half_angle, 1.5))
@@ -146,10 +144,7 @@ def safe_distance_in_water(
     result = simulate(traced, photons=photons, seed=seed, device=device)
     exposed = [result.flux[disc["name"]]["irradiance"] for disc in discs]
     share = np.array([one.values[0, 0] + 2.0 * (0.0 if one.errors is None else one.errors[0, 0]) for one in exposed])
-    beyond = np.flatnonzero(share * _AREA > allowed)
-    if beyond.size == 0:
-        return float(distances[0])
-    last = int(beyond[-1])
+    last = max(np.flatnonzero(share * _AREA > allowed), default=-1)
     return float(distances[min(last + 1, _PLANES - 1)])
 
 

@@ -27,7 +27,6 @@ from spadwarp.device import pick_device
 from spadwarp.frames.response import FWHM_PER_SIGMA
 from spadwarp.scene import Scene, daylight_rate, phase_function, water_lines
 from spadwarp.scene.camera import to_world
-from spadwarp.scene.grid import GridCells
 from spadwarp.scene.medium import grid_cells
 from spadwarp.scene.scene import camera_port, laser_port
 from spadwarp.scene.sight import LinesOfSight, depth_per_time, lines_of_sight
@@ -235,9 +234,10 @@ class _Model:
             rows = self.line_rows([1.0 if by_cells else water.scattering for _, water in self.lines])
             table = sk.single_scatter_table(lidar, self.phase, *self.sights, lines=rows, optics=self.optics)
             paths, cumulative, total = (part.numpy() for part in table)
+            found = BackscatterTable(paths, cumulative)
             if not by_cells:
-                return total, BackscatterTable(paths, cumulative), empty
-            profile = grid_backscatter(self.scene, self.sights[0].numpy(), paths, cumulative, total, gate)
+                return total, found, empty
+            profile = grid_backscatter(self.scene, self.sights[0].numpy(), found, total, gate)
             lidar.source = sk.BACKSCATTER_SOURCES.index("monte_carlo")
         elif profile is None:
             raise ArgumentError("backscatter_profile is missing; analytic.backscatter = 'monte_carlo' needs it")
@@ -346,12 +346,7 @@ def _begin_of_light(scene: Scene, sights: LinesOfSight, points: Floats) -> Float
 
 
 def grid_backscatter(
-    scene: Scene,
-    views: Floats,
-    paths: NDArray[np.float32],
-    cumulative: NDArray[np.float32],
-    total: Floats,
-    gate: tuple[float, float],
+    scene: Scene, views: Floats, table: BackscatterTable, total: Floats, gate: tuple[float, float]
 ) -> NDArray[np.float32]:
     """Detections per pulse and bin of light scattered once, `[P, T]`.
 
@@ -359,53 +354,39 @@ def grid_backscatter(
     point is taken to lose what the line of sight to it loses, by their lengths in the water, as it does for a laser
     beside the camera.
     """
+    medium, cells, every = scene.medium, grid_cells(scene.medium), lines_of_sight(scene, views)
     bins = max(1, round((gate[1] - gate[0]) / scene.gate.bin_width))
-    edges = np.linspace(*gate, bins + 1) * scene.medium.pulse_speed
-    cells, sights = grid_cells(scene.medium), lines_of_sight(scene, views)
-    parts = [
-        _part(scene, cells, sights[k : k + _LINES], paths[k : k + _LINES], cumulative[k : k + _LINES], edges)
-        for k in range(0, len(views), _LINES)
-    ]
-    return (np.concatenate(parts) * total[:, None]).astype(np.float32)
-
-
-def _part(
-    scene: Scene,
-    cells: GridCells,
-    sights: LinesOfSight,
-    paths: NDArray[np.float32],
-    cumulative: NDArray[np.float32],
-    edges: Floats,
-) -> Floats:
-    """The same for a total of 1, for some lines of sight and edges of bins in path [m]."""
-    medium = scene.medium
-    # Length in the water up to where the way by the laser has the longest path.
-    reach = np.nan_to_num(sights.range_from_path(paths[:, -1].astype(np.float64)) - sights.lead)
-    ends = reach[:, None] * np.linspace(0.0, 1.0, _PIECES + 1)
-    middle = 0.5 * (ends[:, 1:] + ends[:, :-1])
-    # The laser's light at the middles: directions and lengths in the water, NaN where none comes; paths by the ends.
-    light, water, path = sights.light_at(sights.start[:, None, :] + ends[..., None] * sights.direction[:, None, :])
-    light, water = light[:, 1:] + light[:, :-1], 0.5 * (water[:, 1:] + water[:, :-1])
-    light = light / np.maximum(np.linalg.norm(light, axis=-1, keepdims=True), 1e-9)
-    lengths = np.nan_to_num(path + ends + sights.delay[:, None])
-    points = sights.start[:, None, :] + middle[..., None] * sights.direction[:, None, :]
-    place, inside = cells.index_of(np.nan_to_num(cells.in_cells(to_world(scene.camera, points)), nan=-1.0))
-    extinction = np.where(inside, cells.extinction[place], medium.extinction)
-    scattering = np.where(inside, cells.scattering[place], medium.scattering)
-    excess = (extinction - medium.extinction) * np.diff(ends, axis=1)
-    excess = np.cumsum(excess, axis=1) - 0.5 * excess
-    weight = scattering * np.exp(-excess * (1.0 + water / np.maximum(middle, 1e-9)))
-    if cells.anisotropy is not None:
-        cosine = -(light * sights.direction[:, None, :]).sum(axis=-1)
-        anisotropy = np.where(inside, cells.anisotropy[place], medium.anisotropy)
-        weight *= _henyey_greenstein(cosine, anisotropy) / _henyey_greenstein(cosine, medium.anisotropy)
-    weight = np.nan_to_num(weight)  # where no light comes
-    result = np.zeros((len(paths), len(edges) - 1))
-    for row in range(len(paths)):
-        share = np.diff(np.interp(lengths[row], paths[row], cumulative[row]))
-        middles = 0.5 * (lengths[row, 1:] + lengths[row, :-1])
-        result[row] = np.histogram(middles, edges, weights=share * weight[row])[0]
-    return result
+    edges, result = np.linspace(*gate, bins + 1) * medium.pulse_speed, np.zeros((len(views), bins))
+    for some in (slice(first, first + _LINES) for first in range(0, len(views), _LINES)):
+        sights = every[some]
+        # Length in the water up to where the way by the laser has the longest path.
+        reach = np.nan_to_num(sights.range_from_path(table.paths[some, -1].astype(np.float64)) - sights.lead)
+        ends = reach[:, None] * np.linspace(0.0, 1.0, _PIECES + 1)
+        middle = 0.5 * (ends[:, 1:] + ends[:, :-1])
+        # The laser's light at the middles: directions and lengths in the water, NaN where none comes; paths by the
+        # ends.
+        start, along = sights.start[:, None, :], sights.direction[:, None, :]
+        light, water, path = sights.light_at(start + ends[..., None] * along)
+        light, water = light[:, 1:] + light[:, :-1], 0.5 * (water[:, 1:] + water[:, :-1])
+        light = light / np.maximum(np.linalg.norm(light, axis=-1, keepdims=True), 1e-9)
+        lengths = np.nan_to_num(path + ends + sights.delay[:, None])
+        points = to_world(scene.camera, start + middle[..., None] * along)
+        place, inside = cells.index_of(np.nan_to_num(cells.in_cells(points), nan=-1.0))
+        extinction = np.where(inside, cells.extinction[place], medium.extinction)
+        scattering = np.where(inside, cells.scattering[place], medium.scattering)
+        excess = (extinction - medium.extinction) * np.diff(ends, axis=1)
+        excess = np.cumsum(excess, axis=1) - 0.5 * excess
+        weight = scattering * np.exp(-excess * (1.0 + water / np.maximum(middle, 1e-9)))
+        if cells.anisotropy is not None:
+            cosine = -(light * along).sum(axis=-1)
+            anisotropy = np.where(inside, cells.anisotropy[place], medium.anisotropy)
+            weight *= _henyey_greenstein(cosine, anisotropy) / _henyey_greenstein(cosine, medium.anisotropy)
+        weight = np.nan_to_num(weight)  # where no light comes
+        rows = zip(lengths, weight, table.paths[some], table.cumulative[some], strict=True)
+        for row, (length, part, paths, cumulative) in enumerate(rows, some.start):
+            share = np.diff(np.interp(length, paths, cumulative))
+            result[row] = np.histogram(0.5 * (length[1:] + length[:-1]), edges, weights=share * part)[0]
+    return (result * total[:, None]).astype(np.float32)
 
 
 def _henyey_greenstein(cosine: Floats, g: Floats | float) -> Floats:

@@ -464,7 +464,7 @@ class _Planner:
             advice += (
                 f", or --method {best}, whose floor is {with_prefix(floor[best], 'm')}: plan with it, for its noise"
             )
-        if purpose not in ("depth error", "false peaks"):
+        if purpose not in _ENOUGH:
             return advice + ("; more pulses do not help" if limit == "forward scattering" else "")
         if frame_time <= self.time:
             return advice

@@ -194,7 +194,9 @@ class HistogramNet(nn.Module):
         bins, (height, width) = counts.shape[-1], counts.shape[1:3]
         exact = torch.autocast(counts.device.type, enabled=False)  # log-likelihoods need more than bfloat16
         with exact, torch.no_grad():
-            volumes = _volumes(counts, background, response)
+            score = log_likelihood(counts, background, response)
+            # Of the pixel, of windows and of belief propagation.
+            volumes = [score, *(side**2 * pooled(score, side) for side in WINDOWS), beliefs(score)]
             tops = [volume.amax(dim=-1) for volume in volumes]
             volumes = [volume.sub_(top[..., None]) for volume, top in zip(volumes, tops, strict=True)]
             cells, images = self._seen(volumes, tops, counts, background, response)
@@ -249,12 +251,6 @@ class HistogramNet(nn.Module):
             *light_channels(counts - background, background.mean(dim=(1, 2)), highest(volumes[-1]), response),
         ]
         return filled_up(cells, self.stride), filled_up(torch.stack(images, dim=1), self.stride)
-
-
-def _volumes(counts: Tensor, background: Tensor, response: Tensor) -> list[Tensor]:
-    """Log-likelihoods of the pixel, of windows and of belief propagation, each `[B, H, W, T]`."""
-    score = log_likelihood(counts, background, response)
-    return [score, *(side**2 * pooled(score, side) for side in WINDOWS), beliefs(score)]
 
 
 def filled_up(image: Tensor, stride: int) -> Tensor:

@@ -38,6 +38,11 @@ class CountFrames(NamedTuple):
     estimated: Background | None = None  # None where the background was given
     defects: Defects | None = None  # None without any
 
+    @property
+    def are_rates(self) -> bool:
+        """Whether some counts are no whole numbers."""
+        return self.counts.dtype.kind not in "biu" and not np.array_equal(self.counts, np.rint(self.counts))
+
     def part(self, bins: slice) -> CountFrames:
         """The same in some bins, of which each has its background."""
         shape = self.counts.shape[-3:] if self.background.ndim == 3 else self.counts.shape[-1:]
@@ -55,8 +60,12 @@ class CountFrames(NamedTuple):
             yield torch.from_numpy(cube.astype(np.float32)[None]).to(place), level, tap
 
 
-def count_frames(counts: ArrayLike, background: ArrayLike, response: ArrayLike) -> CountFrames:
-    """Counts, background and response, checked. Raises `ArgumentError`."""
+def count_frames(counts: ArrayLike, background: ArrayLike | BackgroundLaw, response: ArrayLike) -> CountFrames:
+    """Counts, background and response, checked; the background by a law is estimated. Raises `ArgumentError`."""
+    if isinstance(background, str):
+        given = count_frames(counts, np.zeros(np.shape(counts)[-1]), response)
+        found = estimate_background(given.counts, given.response, law=background)
+        return given._replace(background=found.counts, level_known=False, estimated=found)
     cubes = np.asarray(on_host(counts))
     if cubes.ndim not in (3, 4) or cubes.dtype.kind not in "biuf" or cubes.size == 0:
         raise ArgumentError(f"counts are {cubes.dtype} {cubes.shape}; numbers [H, W, T] or [N, H, W, T] are needed")
@@ -78,22 +87,12 @@ def without_defects(counts: ArrayLike, background: ArrayLike | BackgroundLaw, re
 
     Rates have no defects.
     """
-    if isinstance(background, str):
-        given = count_frames(counts, np.zeros(np.shape(counts)[-1]), response)
-        found = estimate_background(given.counts, given.response, law=background)
-        given = given._replace(background=found.counts, level_known=False, estimated=found)
-    else:
-        given = count_frames(counts, background, response)
-    cubes = given.counts
-    if cubes.dtype.kind not in "biu" and not np.array_equal(cubes, np.rint(cubes)):
+    given = count_frames(counts, background, response)
+    if given.are_rates or not (defects := find_defects(*given[:3])).summary:
         return given
-    defects = find_defects(*given[:3])
-    if not defects.summary:
-        return given
-    cubes = repaired(cubes, defects)
+    cubes = repaired(given.counts, defects)
     if isinstance(background, str):
-        found = estimate_background(cubes, given.response, law=background)
-        given = given._replace(background=found.counts, estimated=found)
+        given = count_frames(cubes, background, response)
     return given._replace(counts=cubes, defects=defects)
 
 

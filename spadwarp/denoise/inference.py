@@ -7,14 +7,14 @@ import warnings
 from collections.abc import Callable
 from itertools import product
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Literal, NamedTuple, get_args
+from typing import Any, Literal, NamedTuple, get_args
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from spadwarp.arrays import on_host, real_array
 from spadwarp.denoise.baselines import BASELINES, CLASSICAL, FROM_COUNTS, METHODS, median_filter
-from spadwarp.denoise.frames import DepthFrames, checked_gate, depth_frames, depth_values, narrowed_input
+from spadwarp.denoise.frames import DepthFrames, checked_gate, depth_frames, depth_values
 from spadwarp.denoise.histograms import CountFrames, count_frames, merged_bins, target_bins, without_defects
 from spadwarp.denoise.network_files import Precision, fast_precision, require_torch, torch_device
 from spadwarp.frames.backgrounds import BackgroundLaw, profile_of_depth
@@ -23,15 +23,6 @@ from spadwarp.frames.response import FWHM_PER_SIGMA, InstrumentResponse
 from spadwarp.values import ArgumentError, SpadwarpWarning, check_choice, check_real
 
 __all__ = ["METHODS", "Estimate", "estimate", "second_return"]
-
-
-if TYPE_CHECKING:
-    from torch import Tensor
-
-
-_WATER = -2.2  # logits below it, and above 0, are sure enough to count how pixels of water, and of the target, report
-_PRIOR = 30.0  # pixels of the target whose reports are assumed to be as those of the water
-_LARGEST = 3.0  # correction of a logit
 
 _ROWS = 64  # whose counts are summed at once: little memory
 _PIXELS_AT_ONCE = {"cpu": 1 << 16, "cuda": 1 << 23}  # a batch that fits into a CPU's cache is faster
@@ -141,7 +132,7 @@ def estimate(
 def detected(found: Estimate, given: CountFrames, *, model: str, min_significance: float) -> Estimate:
     """`found` with the significance of the counts, and neither depth nor target below the least; of rates as it is."""
     least, counts = check_real("min_significance", min_significance, "[0, 1000]"), given.counts
-    if counts.dtype.kind not in "biu" and not np.array_equal(counts, np.rint(counts)):
+    if given.are_rates:
         return found
     side = 1 if model == "likelihood" else 7
 
@@ -297,9 +288,13 @@ def estimate_frames(
     if model in FROM_COUNTS:
         raise ArgumentError(f"model = {model!r} needs counts with their background and response; they are missing")
     if model in BASELINES:
-        return _baseline(frames, model, window, weights)
+        if weights is not None:
+            raise ArgumentError(f"weights are for a network, not for {model!r}")
+        filtered = median_filter(frames, window=window) if model == "median" else BASELINES[model](frames)
+        arrays = np.stack([filtered, ~np.isnan(frames.depth), np.full_like(filtered, np.nan)]).astype(np.float32)
+        return Estimate(*_empty_where(frames.depth, arrays))
     torch = require_torch()
-    from spadwarp.denoise.networks import load_network
+    from spadwarp.denoise.networks import corrected_target, load_network, narrowed_input
 
     place = torch_device(device)
     if model != "pyramid":
@@ -338,46 +333,6 @@ def estimate_frames(
             raise ArgumentError(f"precision = {kind!r}: the network {model!r} gave values that are not finite")
         return estimate_frames(frames, model=model, weights=weights, device=device, precision="float32")
     return Estimate(*_empty_where(frames.depth, answers.numpy()))
-
-
-def _baseline(frames: DepthFrames, model: str, window: int, weights: str | Path | None) -> Estimate:
-    """`estimate_frames` for one of `BASELINES`."""
-    if weights is not None:
-        raise ArgumentError(f"weights are for a network, not for {model!r}")
-    found = median_filter(frames, window=window) if model == "median" else BASELINES[model](frames)
-    answers = np.stack([found, ~np.isnan(frames.depth), np.full_like(found, np.nan)]).astype(np.float32)
-    return Estimate(*_empty_where(frames.depth, answers))
-
-
-def corrected_target(logit: Tensor, depth: Tensor, reported: Tensor, share: Tensor) -> Tensor:
-    """Logit of "sees a target", corrected by what the network is not given, `[N, H, W]`.
-
-    The network sees the part of the gate that holds the target. It cannot tell pixels that reported nothing, which are
-    mostly water, from those that reported backscatter outside that part. How often pixels of the target, and of the
-    water, do one or the other is counted in the frame where the network is sure, and Bayes' rule does the rest. Nor
-    does it see the whole of a large frame: where few pixels report and their depths agree no more often than those of
-    backscatter, a target can take only a `share` of the frame, `[N]`, and its pixels are as much less probable.
-    `reported`: which pixels reported a depth that the network was given, 1 or 0.
-    """
-    import torch
-
-    absent = depth.isnan()
-    beyond = (reported < 0.5) & ~absent
-
-    def counts(chosen: Tensor) -> tuple[Tensor, Tensor]:
-        """Chosen pixels without a report, and with one outside that part of the gate, each `[N]`."""
-        return (chosen & absent).flatten(1).sum(1), (chosen & beyond).flatten(1).sum(1)
-
-    none, some = counts(logit < _WATER)
-    water = (none + 0.5) / (none + some + 1.0)
-    none, some = counts(logit > 0.0)
-    target = (none + _PRIOR * water) / (none + some + _PRIOR)
-    of_absent, of_beyond = (
-        ratio.log().clamp(-_LARGEST, _LARGEST)[:, None, None]
-        for ratio in (target / water, (1.0 - target) / (1.0 - water))
-    )
-    logit = logit + torch.where(absent, of_absent, torch.where(beyond, of_beyond, 0.0))
-    return logit + share.log().clamp_min(-_LARGEST)[:, None, None]
 
 
 _BY_CHANCE = 6.0  # log of the false second returns that are accepted, one in e^6 pixels

@@ -1,4 +1,4 @@
-"""The networks: USDN, DnCNN, and PyramidNet, which also sees the water's backscatter.
+"""The networks: layers, USDN, DnCNN, and PyramidNet, which also sees the water's backscatter; its input from frames.
 
 All take `[batch, 3, height, width]`: depth over the gate (0 at its start, 1 at its end; 1 where nothing was reported),
 1 where the pixel reported something, and the logarithm of the backscatter's density at the reported depth (0 for a flat
@@ -9,22 +9,160 @@ histograms is in `spadwarp.denoise.histogram_network`.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 from functools import lru_cache
 from itertools import pairwise
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any, Literal, NamedTuple
 
 import numpy as np
 import torch
 import torch.nn.functional as F
+from numpy.typing import NDArray
 from safetensors.torch import load_file
 from torch import Tensor, nn
 
+from spadwarp.denoise.frames import LOG_DENSITY_LIMIT, MARGIN
 from spadwarp.denoise.histogram_network import HistogramNet, filled_up
-from spadwarp.denoise.layers import GROUP, SymmetricConv, SymmetricWindow, edge_padded, enlarged, turned
 from spadwarp.denoise.network_files import Precision, weights_header, weights_path
 from spadwarp.values import FileError
+
+# Layers whose derivatives are summed in a fixed order. PyTorch adds those of interpolation, padding and indexing on a
+# GPU with atomic operations, in the order in which threads happen to arrive. The values are PyTorch's own; a seed gives
+# the same weights on a GPU, too.
+
+
+def enlarged(image: Tensor, factor: int) -> Tensor:
+    """Bilinear interpolation of `[B, C, H, W]` to `factor` times as many pixels, an even number."""
+    return _Enlarged.apply(image, factor)  # type: ignore[no-any-return, no-untyped-call]
+
+
+class _Enlarged(torch.autograd.Function):
+    @staticmethod
+    def forward(context: Any, image: Tensor, factor: int) -> Tensor:
+        context.factor = factor
+        return F.interpolate(image, scale_factor=float(factor), mode="bilinear", align_corners=False)
+
+    @staticmethod
+    def backward(context: Any, *derivatives: Tensor) -> tuple[Tensor, None]:
+        (found,), factor = derivatives, context.factor
+        kind, half = found.dtype, factor // 2
+        # A pixel has a part in `2 factor` of the larger image. Beyond a border the image is mirrored: what the mirrored
+        # ones would add is what those at the border have more.
+        parts = [(min(k, 2 * factor - 1 - k) + 0.5) / factor for k in range(2 * factor)]
+        found = found.to(torch.promote_types(kind, torch.float32))
+        for dim in (2, 3):
+            first, last = (found.narrow(dim, place, half).flip(dim) for place in (0, -half))
+            seen = torch.cat([first, found, last], dim).unfold(dim, 2 * factor, factor).unbind(dim=-1)
+            found = seen[0] * parts[0]
+            for part, one in zip(parts[1:], seen[1:], strict=True):
+                found.add_(one, alpha=part)
+        return found.to(kind), None
+
+
+def edge_padded(image: Tensor, reach: int) -> Tensor:
+    """`[B, C, H, W]` with `reach` more pixels on each side, which have the values of the nearest."""
+    for dim in (3, 2):
+        first, last = (image.narrow(dim, place, 1).repeat_interleave(reach, dim) for place in (0, -1))
+        image = torch.cat([first, image, last], dim)
+    return image
+
+
+def permuted(values: Tensor, places: Tensor) -> Tensor:
+    """`values[..., places]`, `[..., g, n]`, for g permutations `[g, n]`: no two derivatives go to the same place."""
+    shape = *values.shape[:-1], *places.shape
+    return values[..., None, :].expand(shape).gather(-1, places.expand(shape))
+
+
+# Convolutions that commute with turns and reflections of a square. A feature has eight channels, one for each turn or
+# reflection of its filter: turning the image turns the channels and permutes them. Cohen & Welling, ICML 2016
+# (group-equivariant convolutional networks, p4m).
+
+GROUP = 8
+"""Turns and reflections of a square."""
+
+
+def turned(image: NDArray[np.int64], element: int) -> NDArray[np.int64]:
+    """An image `[..., k, k]` acted on by one of the eight elements."""
+    return np.rot90(np.flip(image, -1) if element >= 4 else image, element % 4, axes=(-2, -1))
+
+
+_TURNED = np.stack([turned(np.arange(9).reshape(3, 3), element) for element in range(GROUP)])  # places, by element
+
+
+@lru_cache(maxsize=32)
+def _expansion(size: int, channels: Literal[1, 8]) -> Tensor:
+    """Places in a flat filter `[channels, size, size]` that each of the eight takes, `[8, channels size²]`."""
+    elements = _TURNED.reshape(GROUP, -1)
+    products = elements[:, elements]  # of each element, after each g
+    quotients = (products[:, :, None] == elements).all(axis=-1).argmax(axis=0)  # index of g⁻¹ h for g and h
+    places = np.arange(channels * size * size).reshape(channels, size, size)
+    parts = [turned(places[quotients[g]] if channels == GROUP else places, g) for g in range(GROUP)]
+    return torch.from_numpy(np.stack(parts)).flatten(1)
+
+
+class SymmetricConv(nn.Module):
+    """Convolution of features, or of an image's scalar channels with `lifts`, that commutes with `GROUP`.
+
+    With a stride of 2 the symmetry is kept only for filters and images of even sides.
+    """
+
+    places: Tensor  # which are not saved with the weights
+
+    def __init__(
+        self, inputs: int, outputs: int, size: int, *, stride: int = 1, lifts: bool = False, bias: bool = True
+    ) -> None:
+        super().__init__()
+        channels = 1 if lifts else GROUP
+        self.size, self.stride, self.padding = size, stride, (size - stride + 1) // 2
+        self.weight = nn.Parameter(torch.empty(outputs, inputs, channels * size * size))
+        nn.init.normal_(self.weight, std=(2.0 / (inputs * channels * size * size)) ** 0.5)
+        self.bias = nn.Parameter(torch.zeros(outputs)) if bias else None
+        self.register_buffer("places", _expansion(size, channels), persistent=False)
+        self._kept: Tensor | None = None
+
+    def expanded(self) -> Tensor:
+        """The filters of an ordinary convolution, `[8 outputs, inputs, size, size]`."""
+        if self._kept is not None and not torch.is_grad_enabled():
+            return self._kept
+        filters = permuted(self.weight, self.places).unflatten(-1, (-1, self.size, self.size))
+        filters = filters.transpose(1, 2).flatten(2, 3).flatten(0, 1)
+        if torch.is_grad_enabled() or self.training:
+            return filters
+        self._kept = filters.detach().contiguous(memory_format=torch.channels_last)
+        return self._kept
+
+    def train(self, mode: bool = True) -> SymmetricConv:  # called before a network with new weights answers
+        self._kept = None
+        return super().train(mode)
+
+    def forward(self, x: Tensor) -> Tensor:
+        bias = None if self.bias is None else self.bias[:, None].expand(-1, GROUP).flatten()
+        return F.conv2d(x, self.expanded(), bias, self.stride, self.padding)
+
+
+class SymmetricWindow(nn.Module):
+    """Values for the places of a `side` × `side` window around each pixel, which turn with the image."""
+
+    places: Tensor
+    classes: Tensor  # of places with the same bias
+
+    def __init__(self, inputs: int, side: int) -> None:
+        super().__init__()
+        self.weight = nn.Parameter(torch.randn(inputs, side * side) * (0.3 / (GROUP * inputs) ** 0.5))
+        distance = (torch.arange(side) - side // 2).abs()
+        classes = torch.stack([torch.minimum(distance[:, None], distance), torch.maximum(distance[:, None], distance)])
+        _, index = torch.unique(classes.flatten(1), dim=1, return_inverse=True)
+        self.bias = nn.Parameter(torch.zeros(int(index.max()) + 1))
+        self.register_buffer("classes", index, persistent=False)
+        self.register_buffer("places", _expansion(side, 1), persistent=False)
+
+    def filters(self) -> tuple[Tensor, Tensor]:
+        """Weights `[side², 8 inputs]` and biases `[side²]` of a layer of 1 × 1 pixels."""
+        weight = permuted(self.weight, self.places).flatten(0, 1)
+        chosen = self.classes[:, None] == torch.arange(len(self.bias), device=self.bias.device)
+        return weight.t(), (chosen * self.bias).sum(dim=1)
 
 
 class USDN(nn.Module):
@@ -49,9 +187,7 @@ class USDN(nn.Module):
         features = torch.cat([scale(features) for scale in self.scales], dim=1)
         features = F.max_pool2d(features, 7, stride=1, padding=3)
         depth = self.last(edge_padded(features, 3)[..., 1:, 1:])
-        if not self.training:  # while it learns, values beyond the bounds must have a slope
-            depth = depth.clamp(0.0, 1.0)
-        return depth
+        return depth if self.training else depth.clamp(0.0, 1.0)  # what learns has a slope beyond the bounds, too
 
 
 class DnCNN(nn.Module):
@@ -77,7 +213,10 @@ _SCALARS = 4  # scalar channels among the votes: near, wide, depth and support
 _SAME, _ALIKE = 0.012, 0.04  # depths this far apart do not agree, among 3 × 3 and 5 × 5 pixels
 _FAR = 10.0  # behind any depth that is reported
 _BORDER = 3  # pixels of padding, more than those of a pair are apart
-_RING = tuple((y, x) for y in (-1, 0, 1) for x in (-1, 0, 1) if (y, x) != (0, 0))
+_AROUND = tuple((y, x) for y in range(-2, 3) for x in range(-2, 3) if (y, x) != (0, 0))
+_RING = tuple((y, x) for y, x in _AROUND if max(abs(y), abs(x)) == 1)
+# The neighbour beside a pixel, and the one at its corner, turned by each element of `GROUP`.
+_DIRECTIONS = [(int(y) - 1, int(x) - 1) for pixel in (5, 8) for _, y, x in np.argwhere(pixel == _TURNED)]
 _SHARPNESS = 6.0  # a depth with one vote more counts exp(_SHARPNESS) times as much
 
 
@@ -107,7 +246,7 @@ def neighbour_votes(depth: Tensor, reported: Tensor) -> Votes:
     # All images as one line, in which a neighbour is a fixed number of places away; what crosses a border is not used.
     line, row, pixels = image.flatten(), image.shape[3], image.numel()
     line = torch.cat([line, line[: 2 * row + 2]])
-    for step in ((y, x) for y in range(3) for x in range(-2, 3) if (y, x) > (0, 0)):
+    for step in (place for place in _AROUND if place > (0, 0)):
         places = step[0] * row + step[1]
         apart = (line[:pixels] - line[places : places + pixels]).abs_().view_as(image)
         fine, coarse = (torch.rsub(apart, 1.0, alpha=1.0 / most).clamp_min_(0.0) for most in (_SAME, _ALIKE))
@@ -118,10 +257,9 @@ def neighbour_votes(depth: Tensor, reported: Tensor) -> Votes:
         first, second = sorted((one, other))
         return beside(agreeing[second[0] - first[0], second[1] - first[1]][kind], first)
 
-    around = [(y, x) for y in range(-2, 3) for x in range(-2, 3) if (y, x) != (0, 0)]
     single = {place: pair((0, 0), place) for place in _RING}
     near = sum(single.values(), torch.zeros_like(depth)) / 8.0
-    wide = sum((pair((0, 0), place, 1) for place in around), torch.zeros_like(depth)) / 24.0
+    wide = sum((pair((0, 0), place, 1) for place in _AROUND), torch.zeros_like(depth)) / 24.0
     depths = [beside(image, place) for place in _RING]
     counts = [(value < _FAR).float() for value in depths]
     for first, one in enumerate(_RING):
@@ -135,7 +273,7 @@ def neighbour_votes(depth: Tensor, reported: Tensor) -> Votes:
     ring = torch.cat(depths, dim=1)
     total = weight.sum(dim=1, keepdim=True)
     voted = torch.where(total > 0.0, (weight * ring).sum(dim=1, keepdim=True) / total.clamp_min(1e-9), 1.0)
-    agreement = torch.cat([single[place] for place in _directions()], dim=1)
+    agreement = torch.cat([single[place] for place in _DIRECTIONS], dim=1)
     return Votes(near, wide, voted, most / 8.0, agreement)
 
 
@@ -145,14 +283,6 @@ def _apart(rows: int, columns: int, device: torch.device) -> Tensor:
     with torch.inference_mode(False):
         row, column = torch.arange(rows, device=device) % 5, torch.arange(columns, device=device) % 5
         return _FAR + 5.0 * row[:, None] + column
-
-
-@lru_cache(maxsize=1)
-def _directions() -> tuple[tuple[int, int], ...]:
-    """The neighbour beside a pixel, and the one at its corner, turned by each element of `GROUP`."""
-    images = [turned(np.arange(9).reshape(3, 3), element) for element in range(GROUP)]
-    places = (np.argwhere(image == pixel)[0] - 1 for pixel in (5, 8) for image in images)
-    return tuple((int(row), int(column)) for row, column in places)
 
 
 class _Residual(nn.Module):
@@ -371,6 +501,141 @@ def _sorted(a: Tensor, b: Tensor, c: Tensor) -> tuple[Tensor, Tensor, Tensor]:
     a, b = torch.minimum(a, b), torch.maximum(a, b)
     b, c = torch.minimum(b, c), torch.maximum(b, c)
     return torch.minimum(a, b), torch.maximum(a, b), c
+
+
+# The part of a gate that holds the target: networks are more accurate in a gate that is not much wider than that.
+
+_GATE_BINS = 200  # into which a gate is divided
+_CLOSE_BY = (0.01, 0.04)  # parts of the gate within which two depths agree, on flat surfaces and on steep ones
+_AGREEING = 4  # of the 24 pixels around a pixel
+_CLUSTER = 5  # pixels that agree by chance agree together
+_KEPT = 0.7  # a gate is narrowed only to less than this part of its width
+
+
+def gates_of_target(depth: Tensor, density: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+    """The part of the gate outside which depths agree with those around them no more often than backscatter would.
+
+    Of depth over the gate, NaN where nothing was reported, and the density of backscatter there, each `[N, H, W]`: its
+    start and width, with a margin, each `[N]`; 0 and 1, the whole gate, where nothing agrees, or where little would be
+    gained. And the largest part of the frame that a target can take, `[N]`: 1, unless depths agree only as often as
+    those of backscatter would by chance, and more would be noticed.
+    """
+    reported = (depth >= 0.0) & (depth < 1.0)
+    inside = torch.where(reported, depth, torch.nan)
+    share = reported.flatten(1).float().mean(dim=1)
+    place = torch.where(reported, depth * _GATE_BINS, _GATE_BINS).long()
+    one = torch.ones((), device=depth.device)
+    pixels = _sums(one, place)
+
+    def unnoticed(observed: Tensor, expected: Tensor) -> Tensor:
+        """How many bins there are before the first that begin an excess, `[N]`: a cumulative sum with resets."""
+        total = F.pad(expected.cumsum(1), (1, 0))
+        excess = F.pad((observed - 1.1 * expected).cumsum(1), (1, 0))
+        least, before = excess.cummin(1)
+        deviation = (_CLUSTER * (total - total.gather(1, before))).clamp_min(0.0).sqrt()
+        noticed = excess - least > 2.0 * deviation + 2.0
+        begin = before.gather(1, noticed.int().argmax(dim=1, keepdim=True))[:, 0]
+        return torch.where(noticed.any(dim=1), begin, _GATE_BINS)
+
+    first, stop = (torch.full_like(share, bin) for bin in (_GATE_BINS, 0))
+    for near in _CLOSE_BY[::-1]:
+        agreeing = _agreeing(inside, near)
+        # Backscatter of this density, in as many pixels as report, agrees by chance.
+        chance = (2.0 * near * share[:, None, None] * density).clamp(0.0, 1.0)
+        by_chance, observed = (_sums(each, place) for each in (chance, (agreeing >= _AGREEING).float()))
+        part = by_chance / pixels.clamp_min(1.0)
+        fewer = sum(math.comb(24, n) * part**n * (1.0 - part) ** (24 - n) for n in range(_AGREEING))
+        expected = (pixels * (1.0 - fewer)).clamp_min(0.0)
+        total = expected.sum(dim=1)
+        found = observed.sum(dim=1) > total + 4.0 * total.sqrt() + 6.0  # of the last, where chance makes fewer agree
+        first = torch.minimum(first, unnoticed(observed, expected))
+        stop = torch.maximum(stop, _GATE_BINS - unnoticed(observed.flip(1), expected.flip(1)))
+    margin = 2.0 + 0.1 * (stop - first)
+    low, high = ((first - margin) / _GATE_BINS).clamp_min(0.0), ((stop + margin) / _GATE_BINS).clamp_max(1.0)
+    narrower = found & (reported.flatten(1).sum(dim=1) >= 50) & (stop > first) & (high - low < _KEPT)
+    start, width = torch.where(narrower, low, 0.0), torch.where(narrower, high - low, 1.0)
+    # Pairs of pixels within two of each other, those that chance makes agree, and how many more would be noticed.
+    rows, columns = depth.shape[1:]
+    pairs = sum(max(0, rows - abs(y)) * max(0, columns - abs(x)) for y, x in _AROUND)
+    by_chance = by_chance.sum(dim=1) * (pairs / (rows * columns))
+    noticed = 4.0 * (2.0 * by_chance).sqrt() + 12.0
+    agrees = agreeing.flatten(1).sum(dim=1) > by_chance + noticed
+    most = torch.where(agrees, 1.0, (noticed / (pairs * share.square() + 1.0)).clamp_max(1.0))
+    return start.to(depth.dtype), width.to(depth.dtype), most.to(depth.dtype)
+
+
+def narrowed_input(depth: Tensor, density: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+    """Input of PyramidNet `[N, 3, H, W]` over `gates_of_target`, without what is beyond their `MARGIN`; its output."""
+    start, width, part = gates_of_target(depth, density)
+    scaled = (depth - start[:, None, None]) / width[:, None, None]
+    reported = (scaled >= -MARGIN) & (scaled <= 1.0 + MARGIN)
+    log_density = density.log().clamp(-LOG_DENSITY_LIMIT, LOG_DENSITY_LIMIT)
+    channels = torch.where(reported, scaled, 1.0), reported.to(scaled.dtype), torch.where(reported, log_density, 0.0)
+    return torch.stack(channels, dim=1), start, width, part
+
+
+def _agreeing(values: Tensor, near: float) -> Tensor:
+    """How many of the 24 pixels around each pixel are as `near` to it, uint8 `[N, H, W]`; none where either is NaN."""
+    # With two missing pixels after each row, and two such rows after each frame, all are one line in which a neighbour
+    # is a fixed number of places away. Pieces of a line take a GPU half the time of parts cut out of images.
+    padded = F.pad(values, (0, 2, 0, 2), value=torch.nan)
+    line, row = padded.flatten(), padded.shape[2]
+    agreeing = torch.zeros_like(line, dtype=torch.uint8)
+    near_square = float(np.float32(near) ** 2)  # in float32, whose squares tell all numbers about `near` apart
+    for apart in (row * down + right for down, right in _AROUND if (down, right) > (0, 0)):
+        # A square is one pass over memory less than a difference and its absolute value; this one is exact.
+        agree = (F.mse_loss(line[:-apart], line[apart:], reduction="none") < near_square).view(torch.uint8)
+        agreeing[:-apart] += agree
+        agreeing[apart:] += agree
+    return agreeing.view_as(padded)[:, : values.shape[1], : values.shape[2]]
+
+
+def _sums(values: Tensor, place: Tensor) -> Tensor:
+    """Sums `[N, _GATE_BINS]` of values `[N, H, W]`, or one value, by the bin of each pixel; `_GATE_BINS` is in none.
+
+    Column by column, and then of all columns: on a GPU, sums by index into few places wait for each other, and those
+    of neighbouring pixels into neighbouring places do not.
+    """
+    frames, rows, columns = place.shape
+    sums = values.new_zeros(frames, _GATE_BINS + 1, columns)
+    sums.scatter_add_(1, place, values.expand(frames, rows, columns))
+    return sums[:, :_GATE_BINS].sum(dim=2).double()
+
+
+# What the network is not given
+
+_WATER = -2.2  # logits below it, and above 0, are sure enough to count how pixels of water, and of the target, report
+_PRIOR = 30.0  # pixels of the target whose reports are assumed to be as those of the water
+_LARGEST = 3.0  # correction of a logit
+
+
+def corrected_target(logit: Tensor, depth: Tensor, reported: Tensor, share: Tensor) -> Tensor:
+    """Logit of "sees a target", corrected by what the network is not given, `[N, H, W]`.
+
+    The network sees the part of the gate that holds the target. It cannot tell pixels that reported nothing, which are
+    mostly water, from those that reported backscatter outside that part. How often pixels of the target, and of the
+    water, do one or the other is counted in the frame where the network is sure, and Bayes' rule does the rest. Nor
+    does it see the whole of a large frame: where few pixels report and their depths agree no more often than those of
+    backscatter, a target can take only a `share` of the frame, `[N]`, and its pixels are as much less probable.
+    `reported`: which pixels reported a depth that the network was given, 1 or 0.
+    """
+    absent = depth.isnan()
+    beyond = (reported < 0.5) & ~absent
+
+    def counts(chosen: Tensor) -> tuple[Tensor, Tensor]:
+        """Chosen pixels without a report, and with one outside that part of the gate, each `[N]`."""
+        return (chosen & absent).flatten(1).sum(1), (chosen & beyond).flatten(1).sum(1)
+
+    none, some = counts(logit < _WATER)
+    water = (none + 0.5) / (none + some + 1.0)
+    none, some = counts(logit > 0.0)
+    target = (none + _PRIOR * water) / (none + some + _PRIOR)
+    of_absent, of_beyond = (
+        ratio.log().clamp(-_LARGEST, _LARGEST)[:, None, None]
+        for ratio in (target / water, (1.0 - target) / (1.0 - water))
+    )
+    logit = logit + torch.where(absent, of_absent, torch.where(beyond, of_beyond, 0.0))
+    return logit + share.log().clamp_min(-_LARGEST)[:, None, None]
 
 
 NETWORKS: dict[str, Callable[[], nn.Module]] = {

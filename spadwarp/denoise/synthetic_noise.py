@@ -380,9 +380,8 @@ def draw_batch(
         counts = _draw_counts(some, photons, photons / sbr, noise, generator, bins)
         reported[:counted], present[:counted] = _estimate(*counts, photons)
     reported, present = _defects(reported, present, noise, random)
-    profile = crops.profile
     reported = torch.where(present, reported, 1.0)
-    known = torch.where(random.coin(noise.unknown_water)[:, None], 1.0, profile)
+    known = torch.where(random.coin(noise.unknown_water)[:, None], 1.0, crops.profile)
     start, width = crops.camera[:, 0, None, None], crops.camera[:, 1, None, None]
     density = torch.where(present, log_density(known, (reported - start) / width), 0.0)
     frame = torch.stack([reported, present.float(), density], dim=1)

@@ -8,10 +8,13 @@ from __future__ import annotations
 import copy
 import json
 import math
+import os
 import time
 import warnings
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass
+from functools import lru_cache
 from pathlib import Path
 from statistics import fmean
 from typing import Any
@@ -23,12 +26,12 @@ from torch import Tensor, nn
 
 from spadwarp.denoise.classical import highest, log_likelihood
 from spadwarp.denoise.histogram_network import CLOSE, answer, mean_depth
-from spadwarp.denoise.layers import fixed_order
 from spadwarp.denoise.network_files import torch_device
 from spadwarp.denoise.networks import NETWORKS, load_network
 from spadwarp.denoise.recipe import LEAST_CROP, LEVELS, Noise, Part, TrainingRecipe
 from spadwarp.denoise.synthetic_noise import COUNT_BINS, SUBPIXELS, Batch, CleanScenes, draw_batch, procedural_scenes
 from spadwarp.io.paths import atomic_path
+from spadwarp.io.text import duration
 from spadwarp.parallel import interruptible
 from spadwarp.values import ConfigError, FileError
 
@@ -52,28 +55,21 @@ class Samples:
         self.finer = SUBPIXELS if given is None and self.histograms else 1
         self.parts = recipe.parts()
         self.crop, self.size, self.part, self.bins = 0, 0, self.parts[0], COUNT_BINS[0]
-        # By the side of the crops: scenes with the turn in which they were drawn, those of the step, and held ones.
-        self.drawn: dict[int, tuple[int, CleanScenes]] = {}
+        self.drawn = lru_cache(maxsize=1 + (recipe.optimiser.wide > 0))(self._draw)  # for crops of either side
+        # By the side of the crops: scenes of the step, and held ones.
         self.now: dict[int, CleanScenes] = {}
         self.held: dict[int, CleanScenes] = {}
 
-    def _scenes(self, step: int) -> CleanScenes:
-        if self.given is not None:
-            return self.given
-        settings, side = self.recipe.optimiser, self.crop + 32
-        turn = step // settings.redraw
-        if self.crop not in self.drawn or self.drawn[self.crop][0] != turn:
-            seed = (self.recipe.seed * 1_000_003 + turn) * 4096 % 2**62
-            device = self.generator.device
-            scenes = procedural_scenes(settings.scenes, side, seed=seed, device=device, finer=self.finer)
-            self.drawn[self.crop] = turn, scenes
-        return self.drawn[self.crop][1]
+    def _draw(self, turn: int, crop: int) -> CleanScenes:
+        seed = (self.recipe.seed * 1_000_003 + turn) * 4096 % 2**62
+        count, device = self.recipe.optimiser.scenes, self.generator.device
+        return procedural_scenes(count, crop + 32, seed=seed, device=device, finer=self.finer)
 
     def prepare(self, step: int) -> None:
         settings = self.recipe.optimiser
         scale = 2 if np.random.default_rng((self.recipe.seed, step)).random() < settings.wide else 1
         self.crop, self.size = scale * settings.crop, max(1, settings.batch // scale**2)
-        now = self._scenes(step)
+        now = self.drawn(step // settings.redraw, self.crop) if self.given is None else self.given
         if self.histograms:
             host = np.random.default_rng((self.recipe.seed, 0, step))
             self.part = self.parts[host.choice(len(self.parts), p=[part.share for part in self.parts])]
@@ -329,18 +325,13 @@ class Run:
             for name, part in self.state.items():
                 part.load_state_dict(kept[name])
             self.generator.set_state(kept["random"])
-            kept = {**kept, "step": int(kept["step"]), "seconds": float(kept["seconds"])}
+            step, spent, log = int(kept["step"]), float(kept["seconds"]), str(kept["log"])
+            self.loss_sum += float(kept["loss_sum"])
         except (LookupError, TypeError, ValueError, AttributeError, RuntimeError) as error:
             raise FileError(f"{self.checkpoint}: not whole; remove it to start anew: {error}") from error
-        if self.log.is_file():  # a line is written before its checkpoint
-            settings = self.recipe.optimiser
-            done = kept["step"] / settings.interval  # the first line is that of step 0
-            reports = 1 + (math.ceil if kept["step"] == settings.steps else math.floor)(done)
-            lines = self.log.read_text(errors="replace").splitlines(keepends=True)[:reports]
-            with atomic_path(self.log) as temporary:
-                temporary.write_text("".join(lines))
-        self.loss_sum += kept.get("loss_sum", 0.0)
-        return int(kept["step"]), float(kept["seconds"])
+        with atomic_path(self.log) as temporary:  # without a line that was written after the checkpoint
+            temporary.write_text(log)
+        return step, spent
 
     def report(self, psnr: dict[float, float], input_psnr: float) -> None:
         """Writes a line of the log and a checkpoint."""
@@ -420,6 +411,7 @@ class Run:
         kept = {name: part.state_dict() for name, part in self.state.items()}
         kept.update(recipe=self.recipe.model_dump_json(), random=self.generator.get_state(), step=self.step)
         kept.update(loss_sum=float(self.loss_sum), seconds=time.monotonic() - self.began)
+        kept["log"] = self.log.read_text() if self.log.is_file() else ""
         with atomic_path(self.checkpoint) as temporary:
             torch.save(kept, temporary)
 
@@ -450,6 +442,23 @@ PHOTONS = (1.0, 3.0, 10.0, 30.0, 100.0)
 
 _TIMED = 5  # steps after which the duration is foretold
 _VALIDATION_SEED = 2**40  # of drawn scenes, far from those of training
+
+
+@contextmanager
+def fixed_order() -> Iterator[None]:
+    """Convolutions and products of matrices on a GPU by algorithms that give the same bits each time.
+
+    cuDNN otherwise tries several at the first call and keeps the fastest, which differs from one process to the next.
+    TF32 stays allowed in products.
+    """
+    os.environ.setdefault("CUBLAS_WORKSPACE_CONFIG", ":4096:8")  # read when a process first multiplies matrices
+    cudnn, products = torch.backends.cudnn, torch.backends.cuda.matmul
+    before = cudnn.benchmark, cudnn.deterministic, products.allow_tf32
+    cudnn.benchmark, cudnn.deterministic, products.allow_tf32 = False, True, True
+    try:
+        yield
+    finally:
+        cudnn.benchmark, cudnn.deterministic, products.allow_tf32 = before
 
 
 @fixed_order()
@@ -514,8 +523,7 @@ def fit(
 def _duration(device: str, seconds: float, steps: int) -> str:
     """How long the rest of a training takes; on a CPU, what to do instead."""
     left = seconds * steps
-    number, unit = (left, "s") if left < 120 else (left / 60, "minutes") if left < 7200 else (left / 3600, "hours")
-    text = f"{steps} step{'s' * (steps != 1)} to go, about {max(number, 1):.0f} {unit}"
+    text = f"{steps} step{'s' * (steps != 1)} to go, about {duration(max(left, 1.0))}"
     if device != "cpu" or left <= 120:
         return text
     return (

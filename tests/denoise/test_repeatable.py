@@ -8,8 +8,8 @@ import torch.nn.functional as F
 from safetensors.torch import load_file
 
 from spadwarp.denoise import training
-from spadwarp.denoise.layers import edge_padded, enlarged, fixed_order, permuted
 from spadwarp.denoise.network_files import MODELS
+from spadwarp.denoise.networks import edge_padded, enlarged, permuted
 from spadwarp.denoise.recipe import TrainingRecipe
 from spadwarp.denoise.synthetic_noise import procedural_scenes
 
@@ -46,7 +46,7 @@ def test_derivatives_of_permutations(device):
 
 def test_settings_of_the_caller_come_back():
     before = torch.backends.cudnn.benchmark, torch.backends.cudnn.deterministic
-    with pytest.raises(KeyError), fixed_order():
+    with pytest.raises(KeyError), training.fixed_order():
         assert torch.backends.cudnn.deterministic and not torch.backends.cudnn.benchmark
         raise KeyError
     assert (torch.backends.cudnn.benchmark, torch.backends.cudnn.deterministic) == before

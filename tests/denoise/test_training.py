@@ -255,7 +255,7 @@ def test_training_without_a_dataset_draws_scenes_and_says_how_long_it_takes(tmp_
     said, optimiser = [], {**OPTIMISER, "scenes": 4, "redraw": 1}
     recipe = TrainingRecipe.from_dict({"model": "usdn", "seed": 4, "optimiser": optimiser})
     assert fit(recipe, None, None, tmp_path, device="cpu", notify=said.append).weights.is_file()
-    assert said[0] == "1 step to go, about 1 s"  # no advice for so short a time
+    assert said[0] == "1 step to go, about 1.0 s"  # no advice for so short a time
 
 
 def test_a_folder_holds_one_recipe(tmp_path):

@@ -10,9 +10,9 @@ import torch
 from helpers.stepped_frames import GATE, denoised, noisy_frame, scene, scores
 from spadwarp import ArgumentError, DeviceError, FileError
 from spadwarp.denoise import baselines, estimate, inference, networks, weights_metadata
-from spadwarp.denoise.frames import depth_frames, gates_of_target
-from spadwarp.denoise.inference import corrected_target
+from spadwarp.denoise.frames import depth_frames
 from spadwarp.denoise.network_files import MODELS, WEIGHTS
+from spadwarp.denoise.networks import corrected_target, gates_of_target
 from spadwarp.evaluation.drawn_scenes import evaluation_scene, noisy_depth, water_profile
 from spadwarp.frames.backgrounds import bins_of_target, profile_of_depth
 from spadwarp.io.arrays import read_exr
