@@ -102,7 +102,7 @@ def read_depth(
         background: Of counts whose response is known, as `spadwarp.denoise.estimate` takes it, replacing the file's;
             default: the file's, else "decay".
         gate: (start, stop) in depth [m]; of counts whose response is known, only the bins within it are used.
-        gate_time: The same in time of flight [s]; by the group index that is given, or that of a file of counts.
+        gate_time: The same in time of flight [s], by the group index of the file or the one that is given.
         device: Warp device of the estimator.
         measured: What a file of measured histograms does not say, as `read_histograms` takes it, and `group_index` and
             `horizontal_fov_deg`, as `depth_of` does.
@@ -125,7 +125,7 @@ def read_depth(
         if own is not None:
             frames = own.values.astype(np.float32)
             source = f"depth as it is{_remark(held)}"
-            gate = _in_depth(gate_time, place, measured.get("group_index")) or gate_of(held)
+            gate = gate_of(held, gate_time)
             return DepthReading(depth=frames, frames=True, gate=gate, profile=None, source=source, truth=truth)
     found = _stored_depth(place, channel, measured.get("dataset"), as_depth)
     if found is not None:

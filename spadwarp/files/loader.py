@@ -55,8 +55,7 @@ def load(path: str | os.PathLike[str]) -> Held:
     if is_dataset:
         return FrameReader(place, "all")
     if (loader := _LOADERS.get(str(kind))) is None:
-        known = ", ".join(_LOADERS)
-        raise FileError(f"{place}: an HDF5 file, but none of ours: its format is {kind!r}, not one of {known}")
+        raise FileError(f"{place}: an HDF5 file, but none of ours: its format is {kind!r}, not {', '.join(_LOADERS)}")
     return loader(place)
 
 
@@ -115,19 +114,20 @@ def stored_depth(held: Held) -> Reduction | None:
     )
 
 
-def gate_of(held: Held) -> tuple[float, float] | None:
+def gate_of(held: Held, times: tuple[float, float] | None = None) -> tuple[float, float] | None:
     """Ranges at which the gate of an analytic file, a dataset or a scene that moves opens and closes [m], of all its
-    scenes together."""
-    if isinstance(held, FrameReader):
+    scenes together; or of light at other `times` [s]."""
+    if isinstance(held, FrameReader) and times is None:
         gates = np.array([item["gate"] for item in held.with_fields()])
         return float(gates[:, 0].min()), float(gates[:, 1].max())
-    if isinstance(held, AnalyticFile):
-        scene, times = held.scene, (held.scene.gate.start, held.scene.gate.stop)
-    elif isinstance(held, SequenceFile):
-        scene, times = held.base, (held.gate_start, held.gate_start + held.bins * held.bin_width)
+    if isinstance(held, SequenceFile):
+        scene, own = held.base, (held.gate_start, held.gate_start + held.bins * held.bin_width)
+    elif isinstance(held, AnalyticFile | FrameReader):
+        scene = held.scene if isinstance(held, AnalyticFile) else held.scene(0)
+        own = scene.gate.start, scene.gate.stop
     else:
         return None
-    near, far = (range_from_time(time, scene.medium.group_index) + port_advance(scene) for time in times)
+    near, far = (range_from_time(time, scene.medium.group_index) + port_advance(scene) for time in times or own)
     return near, far
 
 

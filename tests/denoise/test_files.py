@@ -18,6 +18,7 @@ from spadwarp.denoise import denoise_file, files
 from spadwarp.denoise.files import read_depth
 from spadwarp.frames import instrument_response
 from spadwarp.io.arrays import write_exr
+from spadwarp.values import range_from_time
 
 BIN = 80e-12
 KNOWN = {"bin_width": BIN, "gate_start": 0.0, "group_index": 1.0}
@@ -191,6 +192,9 @@ def test_histograms_of_a_dataset_are_not_used_and_it_is_said_why(tmp_path):
         found = denoise_file(tmp_path / "set" / name, tmp_path / "out", model="median", device="cpu")
         assert "histograms are not used, since a dataset does not keep their background" in found.notes[0]
         assert np.array_equal(read_depth(tmp_path / "set" / name).depth, stored, equal_nan=True)
+    index, times = FrameReader(tmp_path / "set", "all").scene(0).medium.group_index, (1.3e-7, 1.5e-7)
+    gate = read_depth(tmp_path / "set" / "frames-00000.h5", gate_time=times).gate
+    assert gate == pytest.approx([range_from_time(time, index) for time in times])
 
 
 def test_what_cannot_be_read(tmp_path):
