@@ -210,7 +210,7 @@ def _empty_where(depth: NDArray[Any], found: NDArray[np.float32]) -> NDArray[np.
 
 
 _MARGIN = 32  # pixels around a part of a large frame that are seen, too
-_AT_ONCE = 7 << 20  # bins of all pixels that are computed at once: in float32 less than the 32 MiB that malloc keeps
+_AT_ONCE = 6 << 20  # bins of all pixels that are computed at once: in float32 less than the 32 MiB that malloc keeps
 _LEAST_PART = 96  # pixels of a side: smaller parts would see more of others than of their own
 
 

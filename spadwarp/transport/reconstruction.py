@@ -136,10 +136,10 @@ def known_light(scene: Scene, focus: float | None, device: wp.Device) -> KnownLi
     """From truth rays, also of a lens with this focus [m]."""
     camera, gate, mesh = scene.camera, scene.gate, build_mesh(scene)
     model, pixels = build_model(scene, device, mesh, camera=False), camera.height * camera.width
-    light = wp.zeros((3, pixels, gate.bins * _FINE), dtype=float, device=device)
+    light: Any = wp.zeros((pixels, 3, gate.bins * _FINE), dtype=float, device=device)  # strides are 32-bit
     covered = wp.zeros((pixels, gate.bins), dtype=float, device=device)
     span: Any = wp.zeros(pixels, dtype=wp.vec2i, device=device)
-    known = KnownLight(light[0], light[1], light[2], span, covered, _first_bin(scene, mesh))
+    known = KnownLight(light[:, 0], light[:, 1], light[:, 2], span, covered, _first_bin(scene, mesh))
     radius = 0.0 if camera.pinhole or camera.port is not None or focus is None else camera.aperture_radius
     places, lens = (part[:, None, None] for part in _places(radius))
     height = max(1, _RAYS // (len(places) * camera.width))

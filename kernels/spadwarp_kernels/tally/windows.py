@@ -86,8 +86,8 @@ def deposit_kernel(
                     risen = wp.clamp(after - start, wp.float64(0.0), wp.float64(1.0))
                     part = risen - wp.clamp(after - stop, wp.float64(0.0), wp.float64(1.0))
                     share = float(wp.float64(0.5) * part / size[0])
-                    for kind in range(known.shape[0]):
-                        known[kind, pixel, k] += share * light[ray, i][kind]
+                    for kind in range(known.shape[1]):
+                        known[pixel, kind, k] += share * light[ray, i][kind]
                 if begin < count and stop > wp.float64(0.0):
                     low, high = wp.min(low, begin), wp.max(high, wp.min(last, count))
     for k in range(1, covered.shape[1]):
