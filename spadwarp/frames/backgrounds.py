@@ -126,15 +126,17 @@ def _course(
         level, weight, gain = _fit(seen * whole, exposure * whole, rates, weight)
         level = np.where(whole, level, level[whole.argmax()])  # before the gate is open, no decay can be seen
     level, _, gain = _fit(seen * whole, exposure * whole, rates, weight, _LAST_STEPS)
-    decays, falls = gain > _DECAYS, False
+    decays, falling = gain > _DECAYS, None
     if not decays:
         level, *_ = _fit(seen * whole, exposure * whole, _RATES[:1])
     elif shape is not None:  # of counts: depths alone are too few for it
         falling = _falling(seen * whole, exposure * whole, level, pixels.sum())
-        if falls := falling is not level:
-            free = ~_returns(blocks, (1.0 + tolerance) * scaled[:, None] * falling * opening, width)
-            seen, exposure = (blocks * free).sum(axis=0), scaled @ free
-            level = _falling(seen * whole, exposure * whole, level, pixels.sum())
+    if falling is not None:
+        free = ~_returns(blocks, (1.0 + tolerance) * scaled[:, None] * falling * opening, width)
+        seen, exposure = (blocks * free).sum(axis=0), scaled @ free
+        falling = _falling(seen * whole, exposure * whole, level, pixels.sum())
+    falls = falling is not None
+    level = level if falling is None else falling
     level = np.where(whole, level, level[whole.argmax()])
     if not whole.all():
         level = np.maximum(level * _opening(seen, exposure * level), 1e-9)
@@ -171,22 +173,23 @@ def _opening(seen: NDArray[np.float64], expected: NDArray[np.float64]) -> NDArra
 
 def _falling(
     seen: NDArray[np.float64], exposure: NDArray[np.float64], level: NDArray[np.float64], pixels: float
-) -> NDArray[np.float64]:
-    """Any falling course, where walls end the water: less than half of what decays expect is clearly more likely there.
+) -> NDArray[np.float64] | None:
+    """A falling course of any form, `[T]`, where walls end the water; None without proof of walls.
 
-    Isotonic regression of the counts; linear between the bins that returns leave free.
+    Isotonic regression of the counts, linear between the bins that returns leave free. Proof: bins in which less than
+    half of `level`, a sum of decays, is clearly more likely.
     """
     from scipy.optimize import isotonic_regression
 
     free = np.flatnonzero(exposure > 0.1 * pixels)
     if len(free) < 2:
-        return level
+        return None
     part = seen[free] / exposure[free]
     found = np.maximum(isotonic_regression(part, weights=exposure[free], increasing=False).x, 1e-9)
     less = found < 0.5 * level[free]
     gain = seen[free] * np.log(found / level[free]) - (found - level[free]) * exposure[free]
     if gain[less].sum() < len(np.unique(found[less])) * np.log(len(free)) + _FALSE:
-        return level
+        return None
     return np.interp(np.arange(level.size), free, found)
 
 
