@@ -86,10 +86,8 @@ def estimate_background(counts: ArrayLike, response: ArrayLike | float, *, law: 
     blocks, pixels = _blocks(cube.reshape(-1, *cube.shape[-3:]))
     given = blocks, pixels, return_width(response), _RATES[:1] if law == "flat" else _RATES, cube.shape
     found, opens = _course(*given, law == "decay")
-    if not opens:
-        return found
     # Few early counts mean that a gate opens, or that returns follow: what leaves the smaller error counts.
-    return min(found, _course(*given, False)[0], key=lambda one: one.relative_error)
+    return min(found, _course(*given, False)[0], key=lambda one: one.relative_error) if opens else found
 
 
 def _course(
@@ -135,8 +133,7 @@ def _course(
         free = ~_returns(blocks, (1.0 + tolerance) * scaled[:, None] * falling * opening, width)
         seen, exposure = (blocks * free).sum(axis=0), scaled @ free
         falling = _falling(seen * whole, exposure * whole, level, pixels.sum())
-    falls = falling is not None
-    level = level if falling is None else falling
+        level = level if falling is None else falling
     level = np.where(whole, level, level[whole.argmax()])
     if not whole.all():
         level = np.maximum(level * _opening(seen, exposure * level), 1e-9)
@@ -150,7 +147,8 @@ def _course(
         rows, columns = (-(-side // _BLOCK) for side in shape[-3:-1])
         image = np.kron(scale.reshape(rows, columns), np.ones((_BLOCK, _BLOCK))).astype(np.float32)
         image = image[: shape[-3], : shape[-2]]
-    return Background(level.astype(np.float32), image, error, hidden, bool(decays), falls), not whole.all()
+    found = Background(level.astype(np.float32), image, error, hidden, bool(decays), falling is not None)
+    return found, not whole.all()
 
 
 def _opening(seen: NDArray[np.float64], expected: NDArray[np.float64]) -> NDArray[np.float64]:
@@ -174,10 +172,9 @@ def _opening(seen: NDArray[np.float64], expected: NDArray[np.float64]) -> NDArra
 def _falling(
     seen: NDArray[np.float64], exposure: NDArray[np.float64], level: NDArray[np.float64], pixels: float
 ) -> NDArray[np.float64] | None:
-    """A falling course of any form, `[T]`, where walls end the water; None without proof of walls.
+    """A falling course of any form, `[T]`, where walls end the water: isotonic regression, linear where returns are.
 
-    Isotonic regression of the counts, linear between the bins that returns leave free. Proof: bins in which less than
-    half of `level`, a sum of decays, is clearly more likely.
+    None unless in some bins less than half of `level`, a sum of decays, is clearly more likely.
     """
     from scipy.optimize import isotonic_regression
 
