@@ -426,7 +426,8 @@ def denoise(
             for histograms.
         min_significance (S): Of counts, leave out pixels where background alone gives more with a probability of 10^-S.
             By default detector.min_significance of a simulation, 4 of measured histograms.
-        precision: Of the layers of pyramid: float32, float16 (default on a GPU), bfloat16 (default on a CPU with AMX).
+        precision: Of the layers of pyramid and histograms: float32 (default), bfloat16 (default on a CPU with AMX), or
+            float16 (default of pyramid on a GPU).
 
     \b
     Examples:

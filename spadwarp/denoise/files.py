@@ -370,7 +370,7 @@ def denoise_file(
         if uses_counts and (weights is None or weights_metadata(model, weights)["model"] == "histograms"):
             options["model"] = model = "histograms" if model == "pyramid" else model
             notes.append("denoised with its histograms")
-            found, second = _from_counts(read, **options)
+            found, second = _from_counts(read, precision=precision, **options)
         else:
             found = estimate_depth(read.depth, gate=gate, profile=profile, precision=precision, **options)
         if held is not None:

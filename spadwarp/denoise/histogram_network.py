@@ -50,6 +50,14 @@ def rebinned(counts: Tensor, background: Tensor, response: Tensor, merged: int) 
     return summed(counts), summed(background), summed(response)
 
 
+def halved(counts: Tensor, background: Tensor, response: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+    """The arguments in bins of half the width, of which two share the counts: depths differ by less than a bin."""
+    counts, background = (0.5 * torch.stack([values, values], dim=-1).flatten(-2) for values in (counts, background))
+    between = 0.5 * (F.pad(response, (1, 0)) + F.pad(response, (0, 1)))
+    response = torch.stack([between, F.pad(response, (0, 1))], dim=-1).flatten(1)[:, :-1]
+    return counts, background, 0.5 * response
+
+
 class _Convolution(torch.autograd.Function):
     """Two-dimensional convolution whose derivative by the filters is a product of matrices for each image.
 
@@ -111,8 +119,8 @@ class _Shrink(nn.Conv3d):
     def forward(self, x: Tensor) -> Tensor:
         length = self.kernel_size[2]
         parts = x.unflatten(3, (-1, 2)).unflatten(2, (-1, 2)).unflatten(1, (-1, length))  # [B, N, ·, H, 2, W, 2, n]
-        filters = self.weight.permute(4, 2, 3, 1, 0).flatten(0, 3)
-        return parts.permute(0, 1, 3, 5, 2, 4, 6, 7).flatten(4) @ filters + self.bias
+        filters = self.weight.permute(0, 4, 2, 3, 1).flatten(1)
+        return F.linear(parts.permute(0, 1, 3, 5, 2, 4, 6, 7).flatten(4), filters, self.bias)
 
 
 class _Enlarge(nn.ConvTranspose3d):
@@ -122,7 +130,7 @@ class _Enlarge(nn.ConvTranspose3d):
         filters = self.weight.permute(0, 4, 2, 3, 1).flatten(1)
         parts = (x @ filters).unflatten(-1, (self.kernel_size[2], 2, 2, -1))  # [B, N, H, W, ·, 2, 2, n]
         found = parts.permute(0, 1, 4, 2, 5, 3, 6, 7).flatten(1, 2).flatten(2, 3).flatten(3, 4)
-        return found + self.bias
+        return found + self.bias.to(found.dtype)  # type: ignore[union-attr]
 
 
 class _Residual(nn.Module):

@@ -97,13 +97,18 @@ def without_defects(counts: ArrayLike, background: ArrayLike | BackgroundLaw, re
 
 
 _LEAST_BINS, _MOST_BINS = 64, 512  # of the network
-_WIDEST = 5.0  # deviation of a response [bins]; few in the training are wider
+_NARROWEST, _WIDEST = 1.0, 5.0  # deviation of a response [bins]; few in the training are wider
 
 
-def merged_bins(bins: int, response: NDArray[Any]) -> int:
-    """How many of so many bins the network sees as one: where there are too many, or far more than the response has."""
+def merged_bins(bins: int, response: NDArray[Any]) -> float:
+    """How many of so many bins the network sees as one: several where there are too many, or the response has far more.
+
+    0.5, each as two halves, where most of a return may fall into one: a bin is then too coarse for depths.
+    """
     place = np.arange(response.size) - response.size // 2
     deviation = float(np.sqrt(np.maximum((response * place**2).sum() / response.sum(), 0.0)))
+    if deviation < _NARROWEST and 2 * bins <= _MOST_BINS:
+        return 0.5
     return max(-(-bins // _MOST_BINS), min(int(np.ceil(deviation / _WIDEST)), bins // _LEAST_BINS), 1)
 
 
@@ -114,7 +119,7 @@ def target_bins(frames: CountFrames) -> slice:
     """
     counts, background, response = frames.part(slice(None))[:3]
     (first, stop), bins = bins_of_target(counts, background, response), counts.shape[-1]
-    fewest = _LEAST_BINS * merged_bins(bins, response)
+    fewest = int(_LEAST_BINS * merged_bins(bins, response))
     first = max(0, min(first - max(0, fewest - (stop - first)) // 2, bins - fewest))
     return slice(first, min(bins, max(stop, first + fewest)))
 

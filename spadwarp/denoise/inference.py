@@ -85,9 +85,10 @@ def estimate(
         min_significance: Of counts, pixels below this significance have no depth; 0: every pixel has one.
         weights: File of `spadwarp train`; default: the weights of the package.
         device: torch device of the network; default: the first GPU, else the CPU.
-        precision: Of the layers of PyramidNet for depth alone, "float16", "bfloat16" or "float32". Default: float16 on
-            a GPU; bfloat16 on a CPU with AMX, where it takes half the time and changes depths by less than 0.1 mm in
-            the median; float32 elsewhere. "float32" gives the same depth on every processor, to rounding.
+        precision: Of the layers of PyramidNet and of the network for histograms, "float16", "bfloat16" or "float32".
+            Default: bfloat16 on a CPU with AMX, where layers take half the time and depths change by less than 0.1 mm
+            in the median; float16 of PyramidNet on a GPU; else float32, which gives the same depth on every processor,
+            to rounding.
         progress: Called with ("frames", done, total).
 
     Raises:
@@ -122,7 +123,8 @@ def estimate(
         def to_depth(place: NDArray[np.float32]) -> NDArray[np.float32]:
             return start + (stop - start) * place
 
-        options = {"bins": bins, "bin_width": width, "to_depth": to_depth, "weights": weights, "device": device}
+        options = {"weights": weights, "device": device, "precision": precision}
+        options |= {"bins": bins, "bin_width": width, "to_depth": to_depth}
         found = estimate_histograms(depth, frames, model=model, **options)
         found = detected(found, frames, model=model, min_significance=min_significance)
     shaped: Any = (None if values is None else values.reshape(np.shape(depth)) for values in found)
@@ -183,6 +185,7 @@ def estimate_histograms(
     to_depth: Callable[[NDArray[np.float32]], NDArray[Any]],
     weights: str | Path | None,
     device: str | None,
+    precision: Precision | None = None,
 ) -> Estimate:
     """`estimate` for the methods that use counts, in the bins that hold the target; `bin_width` is in depth [m]."""
     require_torch()
@@ -193,7 +196,7 @@ def estimate_histograms(
         place = classical_depth(frames, method=model, device=device)  # type: ignore[arg-type]
         found = np.stack([place, np.ones_like(place), np.full_like(place, np.nan)])
     else:
-        found = _empty_where(depth, _by_network(frames, weights, device))
+        found = _empty_where(depth, _by_network(frames, weights, torch_device(device), precision))
     found[0] = to_depth(found[0])
     found = found.reshape(3, *depth.shape)
     response = frames.response
@@ -222,26 +225,34 @@ def _parts(length: int, most: int) -> list[tuple[slice, slice, slice]]:
     return [(slice(one, stop), slice(low, stop + _MARGIN), slice(one - low, stop - low)) for one, low, stop in parts]
 
 
-def _by_network(given: CountFrames, weights: str | Path | None, device: str | None) -> NDArray[np.float32]:
+def _by_network(
+    given: CountFrames, weights: str | Path | None, place: Any, precision: Precision | None
+) -> NDArray[np.float32]:
     """Depth over the gate, target probability and confidence, `[3, N, H, W]`."""
     torch = require_torch()
-    from spadwarp.denoise.histogram_network import answer, rebinned
+    from spadwarp.denoise.histogram_network import answer, halved, rebinned
     from spadwarp.denoise.networks import load_network
 
     frames, level = given.counts.reshape(-1, *given.counts.shape[-3:]), given.background
     height, width, bins = frames.shape[1:]
     found = np.empty((3, *frames.shape[:3]), np.float32)
-    network, merged = load_network("histograms", weights, str(torch_device(device))), merged_bins(bins, given.response)
-    most = max(_LEAST_PART, math.isqrt(_AT_ONCE * merged // bins) - 2 * _MARGIN)
+    network, merged = load_network("histograms", weights, str(place)), merged_bins(bins, given.response)
+    if (kind := precision or fast_precision(str(place))) == "float16" and precision is None:
+        kind = "float32"
+    layers = torch.autocast(place.type, dtype=getattr(torch, kind), enabled=kind != "float32")
+    most = max(_LEAST_PART, math.isqrt(int(_AT_ONCE * merged / bins)) - 2 * _MARGIN)
     with torch.inference_mode():
         parts = product(_parts(height, most), _parts(width, most))
         for (rows, seen_rows, inner_rows), (columns, seen_columns, inner_columns) in parts:
             seen = np.s_[..., seen_rows, seen_columns, :]
             part = given._replace(counts=frames[seen], background=level[seen] if level.ndim == 3 else level)
-            for image, (cube, known, taps) in zip(found.swapaxes(0, 1), part.tensors(device), strict=True):
+            for image, (cube, known, taps) in zip(found.swapaxes(0, 1), part.tensors(str(place)), strict=True):
                 if merged > 1:
-                    cube, known, taps = rebinned(cube, known, taps, merged)
-                probability, target = network(cube, known, taps)
+                    cube, known, taps = rebinned(cube, known, taps, int(merged))
+                elif merged < 1:
+                    cube, known, taps = halved(cube, known, taps)
+                with layers:
+                    probability, target = network(cube, known, taps)
                 depth, confidence = answer(probability)
                 depth *= merged * cube.shape[-1] / bins  # the last of merged bins may reach beyond the gate
                 depth += 0.5 * (merged % 2 == 0) / bins  # an even number has no middle: the response is the next's

@@ -62,6 +62,7 @@ class Noise(Section):
     ambient: Share = field(0.0, "of these, samples with ambient light, which follows the reflectance")
     two_returns: Share = field(0.4, "of these, samples in which pixels see a weaker second surface")
     wrong: Share = field(0.0, "of these, samples with a background, and with a response, that are not known well")
+    halves: Share = field(0.0, "of these, samples of a camera with wider bins, each given as two halves")
     resampled: Share = 0.0
     """samples whose depth is the mean over each pixel: at edges it lies between both surfaces"""
     sparse: Share = field(0.25, "samples in which only 3 to 100 % of the pixels report anything")

@@ -21,6 +21,7 @@ from torch import Tensor
 
 from spadwarp.denoise.classical import deviation, highest, interpolated, toeplitz
 from spadwarp.denoise.frames import LOG_DENSITY_LIMIT, MARGIN
+from spadwarp.denoise.histogram_network import halved
 from spadwarp.denoise.recipe import Noise
 
 _THINGS = 10  # at most, in a scene
@@ -110,7 +111,7 @@ def procedural_scenes(count: int, side: int, *, seed: int, device: torch.device 
     texture = 0.5 * smooth_noise(random, side * finer) + 0.3 * _pattern(side, random, finer)
     texture += paint + grain
     if finer > 1:
-        texture *= 1.0 - random.uniform(1, 1) * random.coin(0.4, 1, 1)
+        texture *= 1.0 - (2.0 * random.uniform(1, 1)).clamp_max(1.0) * random.coin(0.4, 1, 1)
     texture = texture.exp()
     if finer > 1:
         texture *= _steepness(metres * finer / random.log_between((0.01, 0.12), 1, 1)).square().add(1.0) ** 0.25
@@ -628,7 +629,20 @@ def _draw_counts(
     level = level * torch.where(random.coin(noise.wrong, 1), random.log_between(_WRONG, 1), 1.0)
     height, slope = (random.normal(1) * random.coin(0.5, 1) for _ in range(2))
     level = level * torch.exp(_ESTIMATED[0] * height + _ESTIMATED[1] * slope * (place - 0.5))
-    return counts, level, given
+    return _in_halves(counts, level, given, random.coin(noise.halves, 1))
+
+
+def _in_halves(counts: Tensor, level: Tensor, response: Tensor, chosen: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+    """The arguments, chosen samples `[B, 1]` as those of a camera with bins twice as wide, which `halved` gives."""
+    pairs = [values.unflatten(-1, (-1, 2)).sum(dim=-1) for values in (counts, level)]
+    before, after = F.pad(response, (1, 0))[:, :-1:2], F.pad(response, (0, 1))[:, 1::2]
+    wide = response[:, ::2] + 0.5 * (before + after)
+    counted, known, taps = halved(*pairs, wide)
+    return (
+        torch.where(chosen[..., None, None], counted, counts),
+        torch.where(chosen, known, level),
+        torch.where(chosen, taps[:, 1:-1], response),
+    )
 
 
 def _second_surface(clean: Tensor, hit: Tensor, noise: Noise, random: Random) -> tuple[Tensor, Tensor]:
