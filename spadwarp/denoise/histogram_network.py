@@ -45,8 +45,10 @@ def rebinned(counts: Tensor, background: Tensor, response: Tensor, merged: int) 
         return F.pad(values, (0, -values.shape[-1] % merged)).unflatten(-1, (-1, merged)).sum(dim=-1)
 
     radius = response.shape[-1] // 2
-    half, reach = merged // 2, -(-radius // merged) * merged
-    response = F.pad(response, (reach + half - radius, reach + merged - 1 - half - radius))
+    around = -(-radius // merged) * merged + merged // 2 - radius
+    if merged % 2 == 0:  # the middle is between two bins
+        response, around = F.avg_pool1d(F.pad(response, (1, 1)), 2, 1), around - 1
+    response = F.pad(response, (around, around))
     return summed(counts), summed(background), summed(response)
 
 

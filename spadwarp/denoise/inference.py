@@ -255,7 +255,6 @@ def _by_network(
                     probability, target = network(cube, known, taps)
                 depth, confidence = answer(probability)
                 depth *= merged * cube.shape[-1] / bins  # the last of merged bins may reach beyond the gate
-                depth += 0.5 * (merged % 2 == 0) / bins  # an even number has no middle: the response is the next's
                 answers = torch.cat([depth, target.sigmoid(), confidence])
                 image[:, rows, columns] = answers[:, inner_rows, inner_columns].cpu().numpy()
     return found
@@ -360,11 +359,11 @@ def second_return(
 ) -> NDArray[np.float32]:
     """Depth over the gate of a second return `[N, H, W]`; NaN where there is no significant one.
 
-    The first return is taken off each histogram: as many counts as lie in it, in the shape of the response. In what
-    remains, beyond the response, the counts of `side` × `side` pixels within the response's width have to exceed the
-    background by more than happens by chance in one of 400 pixels (Poisson likelihood ratio). Light that the water
-    scatters into a pixel from a brighter part of the target is such an excess, too: with hundreds of detections a pixel
-    most pixels have a second return.
+    The first return is taken off each histogram: as many counts as lie in it, in the shape of the response, and what
+    comes later of it in the mean of all pixels, less and less with the delay. In what remains, beyond the response, the
+    counts of `side` × `side` pixels within the response's width have to exceed the background by more than happens by
+    chance in one of 400 pixels (Poisson likelihood ratio). Light that the water scatters into a pixel from a brighter
+    part of the target is such an excess, too: with hundreds of detections a pixel most pixels have a second return.
 
     Args:
         depth: First return over the gate, 0 at its start and 1 at its end, `[H, W]` or `[N, H, W]`.
@@ -386,11 +385,14 @@ def second_return(
             at = (torch.from_numpy(np.nan_to_num(place)).to(cube.device)[None] * bins).long().clamp(0, bins - 1)
             width = float(deviation(taps, 0.1))
             shape = toeplitz(taps, bins)[0].t()[at]  # of the first return in each pixel
-            near = (torch.arange(bins, device=cube.device) - at[..., None]).abs() <= 3.0 * width + 1.0
+            delay = torch.arange(bins, device=cube.device) - at[..., None]
+            near = delay.abs() <= 3.0 * width + 1.0
             signal = ((cube - level) * near).sum(dim=-1, keepdim=True).clamp_min(0.0)
-            rest = torch.where(near, level.expand_as(cube), cube - signal * shape).clamp_min(0.0)
+            late = ~near & (delay > 0)
+            known = level + torch.where(late, signal * _late_light(cube - level, signal, delay, late), 0.0)
+            rest = torch.where(near, known, cube - signal * shape).clamp_min(0.0)
             reach = 2 * round(1.5 * width) + 1
-            image = torch.cat([rest, level.expand_as(cube)])
+            image = torch.cat([rest, known])
             image = pooled(image, side) * side**2
             sums = torch.nn.functional.avg_pool1d(image.flatten(0, 2)[:, None], reach, 1, reach // 2)
             found_counts, expected = (sums.view_as(image) * reach).split(1)
@@ -399,3 +401,23 @@ def second_return(
             significant = score.amax(dim=-1) > math.log(bins) + _BY_CHANCE
             found.append(torch.where(significant, highest(score), math.nan)[0].cpu().numpy())
     return np.stack(found).astype(np.float32)
+
+
+def _late_light(above: Any, signal: Any, delay: Any, late: Any) -> Any:
+    """Part of a first return that comes so many bins later, in the mean of the frame and falling, `[1, H, W, T]`."""
+    torch = require_torch()
+    from scipy.optimize import isotonic_regression
+
+    bins = above.shape[-1]
+    sums = torch.zeros(2, bins, dtype=torch.float64, device=above.device)
+    for row in range(above.shape[1]):  # little memory
+        chosen = late[:, row]
+        for total, part in zip(sums, (above[:, row], signal[:, row].expand_as(above[:, row])), strict=True):
+            total.index_add_(0, delay[:, row][chosen], part[chosen].double())
+    excess, weight = sums.cpu().numpy()
+    there = weight > 0
+    mean = np.zeros(bins)
+    if there.any():
+        fit = isotonic_regression(excess[there] / weight[there], weights=weight[there], increasing=False)
+        mean[there] = np.maximum(fit.x, 0.0)
+    return torch.from_numpy(mean).to(above)[delay.clamp(0, bins - 1)]

@@ -21,7 +21,7 @@ from torch import Tensor
 
 from spadwarp.denoise.classical import deviation, highest, interpolated, toeplitz
 from spadwarp.denoise.frames import LOG_DENSITY_LIMIT, MARGIN
-from spadwarp.denoise.histogram_network import halved
+from spadwarp.denoise.histogram_network import halved, rebinned
 from spadwarp.denoise.recipe import Noise
 
 _THINGS = 10  # at most, in a scene
@@ -634,10 +634,7 @@ def _draw_counts(
 
 def _in_halves(counts: Tensor, level: Tensor, response: Tensor, chosen: Tensor) -> tuple[Tensor, Tensor, Tensor]:
     """The arguments, chosen samples `[B, 1]` as those of a camera with bins twice as wide, which `halved` gives."""
-    pairs = [values.unflatten(-1, (-1, 2)).sum(dim=-1) for values in (counts, level)]
-    before, after = F.pad(response, (1, 0))[:, :-1:2], F.pad(response, (0, 1))[:, 1::2]
-    wide = response[:, ::2] + 0.5 * (before + after)
-    counted, known, taps = halved(*pairs, wide)
+    counted, known, taps = halved(*rebinned(counts, level, response, 2))
     return (
         torch.where(chosen[..., None, None], counted, counts),
         torch.where(chosen, known, level),
