@@ -109,7 +109,9 @@ def test_fine_histograms_are_rebinned():
 
 def test_halves_of_bins_keep_counts_and_the_place_of_returns():
     """A response symmetric about time zero stays so, twice as wide in halves; a quarter of each tap is beside it."""
-    counts, level, taps = halved(torch.tensor([[[[4.0, 2.0]]]]), torch.ones(1, 1, 1, 2), torch.tensor([[0.2, 0.6, 0.2]]))
+    counts, level, taps = halved(
+        torch.tensor([[[[4.0, 2.0]]]]), torch.ones(1, 1, 1, 2), torch.tensor([[0.2, 0.6, 0.2]])
+    )
     torch.testing.assert_close(counts, torch.tensor([[[[2.0, 2.0, 1.0, 1.0]]]]))
     torch.testing.assert_close(level, torch.full((1, 1, 1, 4), 0.5))
     torch.testing.assert_close(taps, torch.tensor([[0.05, 0.1, 0.2, 0.3, 0.2, 0.1, 0.05]]))
@@ -152,7 +154,7 @@ def test_of_two_returns_the_stronger_one_is_found():
 
 @pytest.mark.parametrize(("tail", "share"), [(0.0, 0.0), (0.1, 0.0), (0.0, 0.35), (0.1, 0.35)])
 def test_second_returns_are_told_from_a_late_tail(tail, share):
-    """8 photons, of which a part is 30 bins later in the left half, and a part late by 12 bins in the mean in all pixels.
+    """8 photons, of which a part is 30 bins later in the left half; and in all pixels one that is late by 12 bins.
 
     A response with such a tail is given as its Gaussian alone.
     """
