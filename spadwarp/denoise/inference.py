@@ -360,7 +360,7 @@ def second_return(
     """Depth over the gate of a second return `[N, H, W]`; NaN where there is no significant one.
 
     The first return is taken off each histogram: as many counts as lie in it, in the shape of the response, and what
-    comes later of it in the mean of all pixels, less and less with the delay. In what remains, beyond the response, the
+    comes later of it in the mean of all pixels, never more than earlier. In what remains, beyond the response, the
     counts of `side` × `side` pixels within the response's width have to exceed the background by more than happens by
     chance in one of 400 pixels (Poisson likelihood ratio). Light that the water scatters into a pixel from a brighter
     part of the target is such an excess, too: with hundreds of detections a pixel most pixels have a second return.
@@ -389,9 +389,9 @@ def second_return(
             near = delay.abs() <= 3.0 * width + 1.0
             signal = ((cube - level) * near).sum(dim=-1, keepdim=True).clamp_min(0.0)
             late = ~near & (delay > 0)
-            known = level + torch.where(late, signal * _late_light(cube - level, signal, delay, late), 0.0)
-            rest = torch.where(near, known, cube - signal * shape).clamp_min(0.0)
             reach = 2 * round(1.5 * width) + 1
+            known = level + torch.where(late, signal * _late_light(cube - level, signal, delay, late, reach), 0.0)
+            rest = torch.where(near, known, cube - signal * shape).clamp_min(0.0)
             image = torch.cat([rest, known])
             image = pooled(image, side) * side**2
             sums = torch.nn.functional.avg_pool1d(image.flatten(0, 2)[:, None], reach, 1, reach // 2)
@@ -403,21 +403,18 @@ def second_return(
     return np.stack(found).astype(np.float32)
 
 
-def _late_light(above: Any, signal: Any, delay: Any, late: Any) -> Any:
-    """Part of a first return that comes so many bins later, in the mean of the frame and falling, `[1, H, W, T]`."""
-    torch = require_torch()
-    from scipy.optimize import isotonic_regression
+def _late_light(above: Any, signal: Any, delay: Any, late: Any, reach: int) -> Any:
+    """Part of a first return that comes so many bins later in the mean of the frame, `[1, H, W, T]`; never more than earlier.
 
+    So a second surface behind all of the frame is none of it. `reach`: bins over which the mean is taken, odd.
+    """
+    torch = require_torch()
     bins = above.shape[-1]
     sums = torch.zeros(2, bins, dtype=torch.float64, device=above.device)
     for row in range(above.shape[1]):  # little memory
         chosen = late[:, row]
         for total, part in zip(sums, (above[:, row], signal[:, row].expand_as(above[:, row])), strict=True):
             total.index_add_(0, delay[:, row][chosen], part[chosen].double())
-    excess, weight = sums.cpu().numpy()
-    there = weight > 0
-    mean = np.zeros(bins)
-    if there.any():
-        fit = isotonic_regression(excess[there] / weight[there], weights=weight[there], increasing=False)
-        mean[there] = np.maximum(fit.x, 0.0)
-    return torch.from_numpy(mean).to(above)[delay.clamp(0, bins - 1)]
+    excess, weight = torch.nn.functional.avg_pool1d(sums, reach, 1, reach // 2)
+    falling = torch.where(weight > 0, excess / weight, torch.inf).cummin(dim=0).values.clamp_min(0.0)
+    return torch.where(falling.isfinite(), falling, 0.0).to(above)[delay.clamp(0, bins - 1)]
