@@ -404,9 +404,9 @@ def second_return(
 
 
 def _late_light(above: Any, signal: Any, delay: Any, late: Any, reach: int) -> Any:
-    """Part of a first return that comes so many bins later in the mean of the frame, `[1, H, W, T]`; never more than earlier.
+    """Part of a first return that comes so many bins later in the mean of the frame, never more than earlier.
 
-    So a second surface behind all of the frame is none of it. `reach`: bins over which the mean is taken, odd.
+    `[1, H, W, T]`. So a second surface behind all of the frame is none of it. `reach`: odd, bins of the mean.
     """
     torch = require_torch()
     bins = above.shape[-1]
