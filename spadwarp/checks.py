@@ -732,7 +732,7 @@ def _check_statistics(survey: Survey) -> None:
     if signal > 0.05:
         text = f"{signal:.3g} target detections per pulse and pixel: first-photon counting piles up"
         survey.note("laser.pulse_energy", text, signal_per_pulse=signal)
-    emitted = scene.laser.photons_per_pulse * scene.detections_per_photon or math.inf
+    emitted = scene.detectable_photons_per_pulse or math.inf
     where, field, name, reach = "what a pixel sees", "transport.photons", "samples_per_pixel", samples
     if scene.transport.estimator == "analog":
         reach = signal * traced / scene.scan_positions / emitted

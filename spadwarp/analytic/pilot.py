@@ -205,7 +205,7 @@ def measure(
     if scene.detector.mode == "first_photon":
         recorded = errors(frames, first_photon_probabilities(light, device=device))
         piled = {method: float(median(recorded[method] - error[method])) for method in METHODS}
-    scale = both.scene.laser.photons_per_pulse * scene.detections_per_photon
+    scale = both.scene.detectable_photons_per_pulse
     returned, constant = pool(signal), pool(background)
     peak, level = _return(returned, constant, both.scene)
     bound, shot, information_noise = _bounds(both, (first, second), pool, device)
@@ -327,7 +327,7 @@ def _bounds(result: Result, runs: tuple[Result, Result], pool: _Pool, device: st
     From products of the slopes of both runs, which noise does not change in the mean. Inf where nearly all is noise.
     """
     scene = result.scene
-    scale = scene.laser.photons_per_pulse * scene.detections_per_photon
+    scale = scene.detectable_photons_per_pulse
     signal, first, second = (
         pool(run.component("ballistic") + run.component("forward_scattered")) * scale for run in (result, *runs)
     )

@@ -629,7 +629,7 @@ def _refuse_hopeless(scene: Scene, nearest: float, time: float) -> None:
     returns = 2.0 / (1.0 - reflectance * water.albedo)
     light = returns * reflectance / math.pi * axis_fluence(scene, way) * etendue * passed
     pulses = min(time * laser.repetition_rate / scene.scan_positions, _MOST_PULSES)
-    most = light * laser.photons_per_pulse * scene.detections_per_photon * pulses
+    most = light * scene.detectable_photons_per_pulse * pulses
     if most < 1.0:
         raise ConfigError(
             f"no depth is within reach: of a target at {nearest:.3g} m a pixel detects {most:.2g} photons at most in "

@@ -296,7 +296,7 @@ def _profile(scene: Scene, profile: Any) -> NDArray[np.float32] | None:
     camera, bins = scene.camera, scene.gate.bins
     if isinstance(profile, str | os.PathLike | Result):
         run = as_result(profile, "backscatter_profile")
-        values = run.component("backscatter") * (scene.laser.photons_per_pulse * scene.detections_per_photon)
+        values = run.component("backscatter") * scene.detectable_photons_per_pulse
     else:
         values = profile
     shapes = ((bins,), (camera.height, camera.width, bins))

@@ -221,8 +221,7 @@ def depth(
     summary = {"pixels": pixels, "pixels_with_return": int(found.size), "metres": metres, "quantity": reduced.quantity}
     if 2 * found.size < pixels and min_significance != 0 and reduced.method != "stored":
         text = "--min-significance 0 gives every pixel one, `spadwarp denoise` uses the pixels around it"
-        text = f"{pixels - found.size} of {pixels} pixels have no significant return and so no depth; {text}"
-        complain(text, "note")
+        complain(f"{pixels - found.size} of {pixels} pixels have no significant return and so no depth; {text}", "note")
     answer({**summary, "frames": reduced.frames, "files": files})
 
 

@@ -129,7 +129,7 @@ def evaluate(
     Args:
         data ([DATA]): A dataset's folder; or a Monte Carlo result. Without it, scenes of the package that no training
             saw.
-        models (NAMES): "all", or a list: median, gating, bm3d, usdn, dncnn, pyramid; for results also histograms.
+        models (NAMES): "all", or a list: median, gating, bm3d, usdn, dncnn, pyramid; for results all of `denoise`.
         split: test, validation, train or all.
         frames: Frames of each target and level.
         bm3d_frames: Frames of each level for BM3D, up to a minute each.
@@ -165,7 +165,7 @@ def evaluate(
         if problem := spadwarp.result.noise_problem(result := opt.load_run(data)):
             complain(problem, "warning")  # it counts as light here
         run, show = partial(evaluation.photon_sweep, result), _show_photons
-        options["models"] = [name for name in chosen if name != "bm3d"] + ["histograms"] * (models == "all")
+        options["models"] += ["histograms"] * (models == "all")
 
         def write(found: PhotonSweep, folder: Path) -> list[Path]:
             return [evaluation.draw_photon_sweep(found, folder / "photons.png")]

@@ -219,7 +219,7 @@ def render_transport(plan: Plan, draw: SceneDraw, *, device: str | None, threads
     result = analyser_channel(result, chosen.channel)
     if rebuilt and result.batches > 1:
         result = reconstruct(result, device=device)
-    scale = scene.laser.photons_per_pulse * scene.detections_per_photon
+    scale = scene.detectable_photons_per_pulse
     water = result.expected("backscatter")
     returned = _returned(result)
     seen = returned > 0
@@ -250,7 +250,7 @@ def render_transport(plan: Plan, draw: SceneDraw, *, device: str | None, threads
 def _returned(result: Result) -> Floats:
     """Expected detections per pulse of the light of targets, in the pixels that hold one; 0 in the others."""
     light = result.tallies[:2].sum(axis=(0, 3)) * result.tally_value
-    scale = result.scene.laser.photons_per_pulse * result.scene.detections_per_photon
+    scale = result.scene.detectable_photons_per_pulse
     return np.where(np.isfinite(result.truth.depth), light * scale, 0.0)
 
 

@@ -111,10 +111,10 @@ def compared(models: Sequence[str], weights: str | Path | None, *, counts: bool 
     Raises `ArgumentError`: no such method; one, or weights, of histograms where there are no `counts`.
     """
     for name in models:
-        check_choice("models", name, METHODS)
         if name in FROM_COUNTS and not counts:
-            problem = "needs histograms with their background, which datasets do not keep; evaluate a result"
+            problem = "needs histograms with their background; evaluate a Monte Carlo result, which has them"
             raise ArgumentError(f"models: {name!r} {problem}")
+        check_choice("models", name, [one for one in METHODS if counts or one not in FROM_COUNTS])
     methods: dict[str, dict[str, Any]] = {name: {"model": name, "weights": None} for name in ("input", *models)}
     if weights is None:
         return methods

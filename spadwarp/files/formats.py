@@ -688,7 +688,7 @@ def _components(result: Result, frames: Frames, at: tuple[Any, Any, Any], seed: 
     import warp as wp
 
     scene = result.scene
-    scale, gate = scene.laser.photons_per_pulse * scene.detections_per_photon, scene.gate
+    scale, gate = scene.detectable_photons_per_pulse, scene.gate
     axis, shape = (gate.start, gate.bin_width), result.truth.depth.shape
     choices: dict[str, Any] = {"shape": (*shape, gate.bins), "axis": axis, "device": wp.get_device("cpu")}
     receiver = Receiver.of(scene.detector, scene.laser, irf=frames.irf, **choices)

@@ -150,7 +150,7 @@ def bound_of_result(
 ) -> ResultBound:
     """`crlb`, also where too few photons were traced."""
     scene = result.scene
-    scale = scene.laser.photons_per_pulse * scene.detections_per_photon
+    scale = scene.detectable_photons_per_pulse
     signal = (result.expected("ballistic") + result.expected("forward_scattered")) * scale
     background = result.expected("backscatter") * scale + noise_rate(scene, result.truth) * scene.gate.bin_width
     variance = None

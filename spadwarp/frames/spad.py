@@ -35,7 +35,7 @@ from spadwarp.io.hdf5 import PIXELS, image_coordinates
 from spadwarp.result.analysis import UNKNOWN_NOISE, noise_problem, with_frames
 from spadwarp.result.file import as_result
 from spadwarp.result.result import Result, Truth
-from spadwarp.scene import Detector, Laser, detection_efficiency, noise_rate
+from spadwarp.scene import Detector, Laser, noise_rate
 from spadwarp.values import BIN_WIDTH, SEED, TIME, ArgumentError, Shown, SpadwarpWarning, check_integer, check_real
 
 if TYPE_CHECKING:
@@ -470,15 +470,15 @@ def detect(
             raise ArgumentError("gate_start and bin_width are for arrays: a result has its own; give window instead")
         detector, laser = detector or scene.detector, laser or scene.laser
         gate_start, bin_width = scene.gate.start, scene.gate.bin_width
-        detections_per_photon = laser.photons_per_pulse * detection_efficiency(laser, detector)
+        scene = scene.model_copy(update={"detector": detector, "laser": laser})
+        scale = scene.detectable_photons_per_pulse
         if background is None:
             expected = getattr(source, "expected", source.component)  # a TorchResult has no other light
-            background = expected("backscatter") * detections_per_photon
+            background = expected("backscatter") * scale
         if ambient is None and scene.daylight is not None:
-            lit = scene.model_copy(update={"detector": detector, "laser": laser})
             truth = Truth(**{name: on_host(getattr(source.truth, name)) for name in Truth.__dataclass_fields__})
-            ambient = noise_rate(lit, truth)[..., 0] - detector.noise_rate
-        source = (source.expected() if isinstance(source, Result) else source.histogram) * detections_per_photon
+            ambient = noise_rate(scene, truth)[..., 0] - detector.noise_rate
+        source = (source.expected() if isinstance(source, Result) else source.histogram) * scale
     detector = detector or Detector()
     pulses = detector.pulses_per_frame if pulses is None else pulses
     arguments = {"pulses": pulses, "frames": frames, "first_frame": first_frame, "seed": seed}

@@ -195,7 +195,7 @@ def lidar_initial_guess(scene: Scene, exposure: Exposure, *, device: str | None 
     view = camera.pixel_tangent**2  # of a pixel [sr]
     beam = 2.0 * math.pi * (1.0 - math.cos(scene.laser.half_angle))
     backward = float(phase_function(scene.medium).density(np.array([math.pi]))[0])
-    caught = scene.laser.photons_per_pulse * scene.detections_per_photon * min(view / max(beam, 1e-12), 1.0)
+    caught = scene.detectable_photons_per_pulse * min(view / max(beam, 1e-12), 1.0)
     scattering = math.exp(level) / (caught * camera.aperture_area * backward * 0.5 * speed * dt)
     decay = max(-0.5 * slope, 0.02)
     scattering = min(max(scattering, 0.05 * decay), 10.0 * decay)

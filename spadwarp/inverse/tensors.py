@@ -70,7 +70,7 @@ def render(
                     means = {name.rpartition(".")[2]: arrays[name] for name in of_grid}
                     at = with_block_means(at, means, Path(folder))
                 result = simulate(at, **options)
-                scale = at.laser.photons_per_pulse * at.detections_per_photon
+                scale = at.detectable_photons_per_pulse
                 ctx.slopes = None
                 if any(ctx.needs_input_grad):
                     other = simulate(

@@ -49,7 +49,7 @@ class TorchResult:
     @property
     def detections(self) -> torch.Tensor:
         """`[H, W, T]`."""
-        return self.histogram * (self.scene.laser.photons_per_pulse * self.scene.detections_per_photon)
+        return self.histogram * self.scene.detectable_photons_per_pulse
 
     @property
     def intensity(self) -> torch.Tensor:

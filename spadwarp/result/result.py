@@ -251,7 +251,7 @@ class Result(Shown, ResultHead, Tallies):
     @property
     def detections(self) -> Floats:
         """Expected detections per pulse, float64 `[H, W, T]`: histogram · photons per pulse · PDE."""
-        return self.histogram * np.float64(self.scene.laser.photons_per_pulse * self.scene.detections_per_photon)
+        return self.histogram * np.float64(self.scene.detectable_photons_per_pulse)
 
     @cached_property
     def tally_value(self) -> Floats:
@@ -505,9 +505,7 @@ class Result(Shown, ResultHead, Tallies):
                 **({} if scene.medium.grid is None else {"grid": scene.medium.grid.shape or scene.medium.grid.file}),
             },
             "collected_fraction": dict(zip(scene.components, map(float, fractions), strict=True)),
-            "detections_per_pulse": float(
-                fractions.sum() * scene.laser.photons_per_pulse * scene.detections_per_photon
-            ),
+            "detections_per_pulse": float(fractions.sum() * scene.detectable_photons_per_pulse),
             "pixels_with_return": int(np.count_nonzero(self.tallies.any(axis=(0, 3)))),
             "truth": {
                 "pixels": int(seen.sum()),
@@ -774,7 +772,7 @@ def _noise_ratios(result: Result, pixels: NDArray[np.intp]) -> Floats:
     tallies, moments = result.tallies.reshape(components, -1, bins), result.known_moment.reshape(2, -1, bins)
     size = max(1, _PART_VOXELS // bins)
     scene, value, better = result.scene, result.tally_value.reshape(-1), result.reconstruction
-    per_pulse = scene.laser.photons_per_pulse * scene.detections_per_photon
+    per_pulse = scene.detectable_photons_per_pulse
     target = np.isfinite(result.truth.depth).reshape(-1)
     noise = np.broadcast_to(noise_rate(scene, result.truth), (*result.truth.depth.shape, 1)).reshape(-1)
     ratios = np.full(len(pixels), np.nan)

@@ -26,7 +26,7 @@ from spadwarp.scene.settings import Detector
 from spadwarp.values import PLANCK, SPEED_OF_LIGHT, ConfigError, FileError, Interval
 from spadwarp.water.seawater import RANGES
 
-__all__ = ["Laser", "SpectralLine", "detection_efficiency", "filter_transmission", "spectral_lines"]
+__all__ = ["Laser", "SpectralLine", "filter_transmission", "spectral_lines"]
 
 ENERGIES = ("pulse_energy", "average_power", "peak_power")
 """How the energy of a pulse is given."""
@@ -249,14 +249,6 @@ def spectral_lines(laser: Laser, detector: Detector) -> tuple[SpectralLine, ...]
     share = np.bincount(group, photons, _MOST_LINES)
     moment = np.bincount(group, photons * wavelength, _MOST_LINES)
     return tuple(SpectralLine(float(m / s), float(s)) for s, m in zip(share, moment, strict=True) if s > 0.0)
-
-
-def detection_efficiency(laser: Laser, detector: Detector) -> float:
-    """Detections for each photon of the laser that reaches a pixel: PDE, times what the filter passes of the spectrum.
-
-    Photons are counted as if the pulse had the one wavelength `laser.wavelength_nm`. Raises as `spectral_lines` does.
-    """
-    return detector.pde * math.fsum(line.share for line in spectral_lines(laser, detector))
 
 
 def _passed(laser: Laser, detector: Detector) -> tuple[Floats, Floats]:

@@ -17,7 +17,7 @@ from spadwarp.io.paths import MESH_ENDINGS, example_or_path, used
 from spadwarp.io.text import csv_lines, read_text, read_toml
 from spadwarp.scene import settings
 from spadwarp.scene.camera import Camera, pixel_directions, to_camera, to_world
-from spadwarp.scene.laser import Laser, detection_efficiency, spectral_lines
+from spadwarp.scene.laser import Laser, spectral_lines
 from spadwarp.scene.medium import Medium, phase_function
 from spadwarp.scene.port import Port, PortGeometry
 from spadwarp.scene.pose import rotation_angles, rotation_matrix, turned, unit_vector, vector_of
@@ -295,9 +295,16 @@ class Scene(Shown, Document):
     def detections_per_photon(self) -> float:
         """Detections for each photon of a pulse that reaches a pixel: PDE, times what the filter passes.
 
-        Raises `FileError` or `ConfigError` if the table of a spectrum or a filter cannot be read.
+        Photons are counted as if the pulse had the one wavelength `laser.wavelength_nm`. Raises `FileError` or
+        `ConfigError` if the table of a spectrum or a filter cannot be read.
         """
-        return detection_efficiency(self.laser, self.detector)
+        return self.detector.pde * math.fsum(line.share for line in spectral_lines(self.laser, self.detector))
+
+    @property
+    def detectable_photons_per_pulse(self) -> float:
+        """Expected detections of a pulse if all of its photons reached pixels [1]; a fraction that arrives, as in a
+        histogram, times this is the expected detections per pulse. Raises as `detections_per_photon` does."""
+        return self.laser.photons_per_pulse * self.detections_per_photon
 
     @property
     def pulses_per_depth_frame(self) -> int:

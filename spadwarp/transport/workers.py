@@ -600,7 +600,7 @@ class LightTracer:
         worker.clear()
         worker.trace((first, first + photons), stopped=threading.Event())
         scene, data, names = self._scene, worker.data, self._names
-        per_photon = scene.laser.photons_per_pulse * scene.detections_per_photon
+        per_photon = scene.detectable_photons_per_pulse
         value = per_photon / photons_per_position(scene, ((first, first + photons),)).reshape(-1)
         slopes = {
             name: self._light(data.gradients, value * unit, len(names), p)

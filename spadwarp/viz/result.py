@@ -211,7 +211,7 @@ def _result_figure(
         panels.figure.note(_HATCHED.format(_hatched(unclear), " or a reconstruction" if more else ""))
     if kind == "intensity":
         panels.unclear = unclear
-        per_pulse = result.scene.laser.photons_per_pulse * result.scene.detections_per_photon
+        per_pulse = result.scene.detectable_photons_per_pulse
         ballistic = result.expected("ballistic").sum(axis=-1)
         panels.show_intensity(result.intensity * per_pulse, "All light in the gate", "expected detections per pulse")
         panels.unclear = None
@@ -282,7 +282,7 @@ def _plot_pixel(result: Result, axis: Axes, row: int, column: int) -> bool:
 
     Where light is sparse, bins are added up until their sum is known to a third, see `merged_edges`; returns whether.
     """
-    per_pulse = result.scene.laser.photons_per_pulse * result.scene.detections_per_photon
+    per_pulse = result.scene.detectable_photons_per_pulse
     time, better = 1e9 * result.bin_edges, result.reconstruction
     error = np.zeros(len(time) - 1)  # without batches it is not known, and bins stay as they are
     if better is not None:

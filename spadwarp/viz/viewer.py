@@ -117,7 +117,7 @@ def _layer(label: str, colour: str, cube: NDArray[Any], factor: float = 1.0, *, 
 
 def _of_result(result: Result, method: str | None, device: Any) -> _Page:
     scene = result.scene
-    per_pulse = scene.laser.photons_per_pulse * scene.detections_per_photon
+    per_pulse = scene.detectable_photons_per_pulse
     smooth = result.reconstruction
     # In a scan the positions' numbers of photons differ by one at most.
     scale = per_pulse * (float(result.tally_value.mean()) if smooth is None else 1.0)
@@ -375,7 +375,7 @@ def _light(run: Held, frame: int) -> tuple[NDArray[np.float64], NDArray[np.float
     """Histograms `[H, W, T]`, edges [ns], what they count, metres of path per ns."""
     cube: NDArray[Any]
     if isinstance(run, Result):
-        cube = run.expected() * (run.scene.laser.photons_per_pulse * run.scene.detections_per_photon)
+        cube = run.expected() * run.scene.detectable_photons_per_pulse
         return cube, 1e9 * run.bin_edges, "detections per pulse, pixel", 1e-9 * run.pulse_speed
     scene: Any
     if isinstance(run, FramesFile):

@@ -122,8 +122,8 @@ def test_evaluation_and_report(dataset, tmp_path):
 def test_evaluation_refuses_what_it_cannot_do(dataset, tmp_path):
     foreign = {"models": ("dncnn",), "weights": network_files.WEIGHTS / "histograms.safetensors"}
     for folder, options, message in (
-        (dataset, {"models": ("unet",)}, "'unet' is not one of"),
-        (dataset, {"models": ("histograms",)}, "needs histograms with their background, which datasets do not keep"),
+        (dataset, {"models": ("unet",)}, "'unet' .* 'pyramid', 'dncnn', 'usdn', 'median', 'gating', 'bm3d'$"),
+        (dataset, {"models": ("histograms",)}, "needs histograms with their background; evaluate a Monte Carlo result"),
         (dataset, {"models": ("median",), "crop": (65, 48)}, r"crop = \(65, 48\) is outside \(8, 8\) to \(64, 48\)"),
         (dataset, foreign, "of the network for histograms; evaluate a result"),
         (tmp_path, {}, "no dataset there"),
@@ -215,8 +215,9 @@ def test_a_sweep_over_photons(wall, tmp_path):
     assert (np.diff(sweep.rmse["input"]) < 0).all()
     assert sweep.saving("input")[0, 0] == pytest.approx(1.0)
     assert photon_counts.draw_photon_sweep(sweep, tmp_path / "photons.png").stat().st_size > 10_000
-    with pytest.raises(ValueError, match="sbr"):
-        photon_counts.photon_sweep(wall, sbr=(0.0,))
+    for options, message in (({"sbr": (0.0,)}, "sbr"), ({"models": ("poled",)}, "'histograms', .* mean 'pooled'")):
+        with pytest.raises(ValueError, match=message):
+            photon_counts.photon_sweep(wall, **options)
 
 
 # No leakage
