@@ -18,9 +18,6 @@ LOG_DENSITY_LIMIT = 4.0
 MARGIN = 0.25
 """Depths this part of the gate's width before or behind it are still taken: a gate in range is not one in depth."""
 
-SMALLEST_SIDE = 8
-"""Fewest rows or columns of a frame."""
-
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class DepthFrames:
@@ -86,11 +83,8 @@ def depth_frames(
     if values.ndim not in (2, 3):
         raise ArgumentError(f"depth has shape {values.shape}; [H, W] or [N, H, W] is needed")
     values = values if values.ndim == 3 else values[None]
-    if min(values.shape[1:]) < SMALLEST_SIDE or len(values) == 0:
-        raise ArgumentError(
-            f"depth is {len(values)} frames of {values.shape[1]} x {values.shape[2]} pixels; at least one frame of "
-            f"{SMALLEST_SIDE} x {SMALLEST_SIDE} pixels is needed"
-        )
+    if values.size == 0:
+        raise ArgumentError(f"depth has shape {values.shape}; at least one frame of one pixel is needed")
     start, stop = checked_gate(gate)
     if (values[np.isfinite(values)] < 0).any():
         raise ArgumentError(f"depth {np.nanmin(values)} m is outside [0, inf) m")
