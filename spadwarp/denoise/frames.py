@@ -46,8 +46,7 @@ class DepthFrames:
 
         Missing ones get the nearest depth where those around them report nearly as often as elsewhere.
         """
-        images = map(_filled, self.scaled, self.density)
-        return np.stack([np.nan_to_num(image, nan=1.0) for image in images])
+        return np.nan_to_num(np.stack([*map(_filled, self.scaled, self.density)]), nan=1.0)
 
 
 def checked_gate(gate: tuple[float, float]) -> tuple[float, float]:
@@ -87,10 +86,8 @@ def depth_frames(
         raise ArgumentError(f"depth has shape {values.shape}; [H, W] or [N, H, W] is needed")
     values = values if values.ndim == 3 else values[None]
     if min(values.shape[1:]) < SMALLEST_SIDE or len(values) == 0:
-        raise ArgumentError(
-            f"depth is {len(values)} frames of {values.shape[1]} x {values.shape[2]} pixels; at least one frame of "
-            f"{SMALLEST_SIDE} x {SMALLEST_SIDE} pixels is needed"
-        )
+        size = f"{len(values)} frames of {values.shape[1]} x {values.shape[2]} pixels"
+        raise ArgumentError(f"depth is {size}; at least one of {SMALLEST_SIDE} x {SMALLEST_SIDE} pixels is needed")
     start, stop = checked_gate(gate)
     if (values[np.isfinite(values)] < 0).any():
         raise ArgumentError(f"depth {np.nanmin(values)} m is outside [0, inf) m")
@@ -98,11 +95,8 @@ def depth_frames(
     slack = MARGIN * (stop - start)
     outside = present & ~((values >= start - slack) & (values <= stop + slack))
     if outside.any():
-        warnings.warn(
-            f"{outside.sum()} of {present.sum()} depths lie outside the gate of {start:g} to {stop:g} m and count as "
-            "not reported",
-            stacklevel=2,
-        )
+        text = f"{outside.sum()} of {present.sum()} depths lie outside the gate of {start:g} to {stop:g} m"
+        warnings.warn(f"{text} and count as not reported", stacklevel=2)
     values = np.where(present & ~outside, values, np.float32(np.nan))
     relative = np.ones_like(values)
     if density is not None:
