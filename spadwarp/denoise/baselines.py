@@ -38,8 +38,7 @@ def gated_filter(frames: DepthFrames) -> Frames:
     """
     bins, out = 100, frames.depth.copy()
     for depth, scaled, density in zip(out, frames.scaled, frames.density, strict=True):
-        with np.errstate(invalid="ignore"):
-            valid = (scaled >= 0) & (scaled < 1)
+        valid = (scaled >= 0) & (scaled < 1)
         place = (scaled[valid] * bins).astype(np.int64)
         counts = np.bincount(place, minlength=bins).astype(np.float64)
         # Mean density of the depths in each bin; empty bins take that of the last one before.
@@ -52,8 +51,7 @@ def gated_filter(frames: DepthFrames) -> Frames:
         if excess.any():
             within = np.cumsum(excess) / excess.sum()
             first, last = np.searchsorted(within, (0.005, 0.995))
-            with np.errstate(invalid="ignore"):
-                depth[(scaled < (first - 1) / bins) | (scaled > (last + 2) / bins)] = np.nan
+            depth[(scaled < (first - 1) / bins) | (scaled > (last + 2) / bins)] = np.nan
     return median_filter(replace(frames, depth=out), window=3)
 
 
@@ -91,7 +89,6 @@ BASELINES: dict[str, Callable[[DepthFrames], Frames]] = {
 
 
 # Names of the methods that estimate depth from counts, and of all.
-
 
 Classical = Literal["likelihood", "pooled", "semi-global", "total-variation", "belief-propagation"]
 

@@ -141,7 +141,6 @@ def highest(score: Tensor) -> Tensor:
 
 # Semi-global matching on a volume of log-likelihoods: Hirschmüller, IEEE TPAMI 30, 328 (2008).
 
-
 _JUMPS = 12.0, 60.0  # limits of the usual penalty of any other depth [nats]
 
 
@@ -167,10 +166,8 @@ def _messages(score: Tensor, *, columns: bool, jump: float, slope: float) -> Ten
         cubes = score.contiguous(), received
         sent, found = (cast(wp.array, wp.from_torch(cube.flatten(), requires_grad=False)) for cube in cubes)
         stream = wp.stream_from_torch(torch.cuda.current_stream(score.device))
-        frames, height, width, bins = score.shape
-        launch_messages(
-            sent, found, (frames, height, width, bins), columns=columns, jump=jump, slope=slope, stream=stream
-        )
+        shape = cast(tuple[int, int, int, int], tuple(score.shape))
+        launch_messages(sent, found, shape, columns=columns, jump=jump, slope=slope, stream=stream)
         return received
     along = 1 if columns else 2
     _sweep(score.movedim(along, 0), received.movedim(along, 0), jump, slope)
@@ -198,7 +195,6 @@ def _sweep(lines: Tensor, sums: Tensor, jump: float, slope: float) -> None:
 
 # Belief propagation on a volume of log-likelihoods: the depths that are most probable where neighbours mostly agree.
 
-
 JUMP = 4.0
 """Usual penalty of any other depth [nats]."""
 
@@ -212,11 +208,9 @@ def beliefs(score: Tensor, jump: float = JUMP) -> Tensor:
     `jump`: penalty of any other depth [nats].
     """
     rows = columns = score.new_zeros(())
+    cost = {"jump": jump, "slope": _SLOPE}
     for _ in range(_ROUNDS):
-        rows, columns = (
-            _messages(score + others, columns=vertical, jump=jump, slope=_SLOPE)
-            for others, vertical in ((columns, False), (rows, True))
-        )
+        rows, columns = _messages(score + columns, columns=False, **cost), _messages(score + rows, columns=True, **cost)
     return (rows + columns).add_(score)
 
 

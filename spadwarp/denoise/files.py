@@ -35,8 +35,8 @@ from spadwarp.frames.backgrounds import BackgroundLaw
 from spadwarp.frames.depth import FARTHEST, Method, Quantity, depth_of, geometry, with_view
 from spadwarp.frames.file import SequenceFile
 from spadwarp.frames.measured import Histograms, read_histograms, stored_images
-from spadwarp.io.arrays import read_exr, write_exr
-from spadwarp.io.paths import atomic_path, existing_file
+from spadwarp.io.arrays import read_exr, write_array, write_exr
+from spadwarp.io.paths import existing_file
 from spadwarp.result import Result
 from spadwarp.scene.sections import file_of
 from spadwarp.scene.sight import depth_from_time
@@ -233,12 +233,15 @@ def _estimate_depth(histograms: Histograms, counted: bool, method: Method | None
     scene = histograms.scene
     index = scene.medium.group_index if scene is not None else float(histograms.group_index or 1.0)
     gate_stop = histograms.gate_start + histograms.values.shape[-1] * float(histograms.bin_width or 0.0)
+    known = histograms.background_per_bin
+    backscatter = None if known is None else known.reshape(-1, known.shape[-1]).sum(axis=0, dtype=np.float64)
     depth = reduced.values.astype(np.float32)
     depth[depth <= 0.0] = np.nan  # a peak of noise at the time of the pulse
     dim = [] if counted else dim_pixels(histograms)
     source = "; ".join([f"{reduced.quantity} by {method} from histograms", *histograms.notes, *dim])
     return DepthReading(
-        depth=depth, quantity=reduced.quantity, frames=reduced.frames > 1, profile=backscatter_profile(histograms),
+        depth=depth, quantity=reduced.quantity, frames=reduced.frames > 1,
+        profile=backscatter if backscatter is not None and backscatter.sum() > 0 else None,
         gate=(range_from_time(histograms.gate_start, index), range_from_time(gate_stop, index)), source=source,
         histograms=histograms if counted else None,
     )  # fmt: skip
@@ -267,15 +270,6 @@ def _within(held: Histograms, gate: tuple[float, float]) -> Histograms:
     return dataclasses.replace(
         held, values=held.values[..., first:stop], gate_start=held.gate_start + first * width, background=known
     )
-
-
-def backscatter_profile(histograms: Histograms) -> NDArray[np.float64] | None:
-    """Backscatter of all pixels together over the bins; None where the file does not give it."""
-    background = histograms.background_per_bin
-    if background is None:
-        return None
-    total = np.asarray(background, np.float64).reshape(-1, background.shape[-1]).sum(axis=0)
-    return total if total.sum() > 0 else None
 
 
 # Denoising: depth or histograms in, denoised depth out.
@@ -388,6 +382,9 @@ def denoise_file(
     shown = found.masked(threshold)[0]
     files = _write(folder, name, read, Estimate(depth, *found[1:]), second, model)
     notes += _worse(read.depth, depth, model, gate)
+    target = found.target_probability >= threshold
+    if target.any() and (sure := float(np.median(found.confidence[target]))) < 0.5:
+        notes.append(f"unsure: half of the targets' depths are right to 1 % of the gate with a probability below {sure:.2f}")
     if model == "usdn" and weights is None:
         notes.append("usdn, for comparison: its depths are off by 1 to 3 cm even without noise; pyramid is better")
     style: dict[str, Any] = {"quantity": read.quantity, "title": f"{Path(path).name}: {model}"}
@@ -425,19 +422,17 @@ def _write(
     folder: Path, name: str, read: DepthReading, found: Estimate, second: NDArray[np.float32] | None, method: str
 ) -> list[Path]:
     """Writes the arrays and the EXR of `denoise_file`; their paths."""
-    arrays = {"": found.depth, "_target": found.target_probability, "_confidence": found.confidence}
-    if found.significance is not None:
-        arrays["_significance"] = found.significance
-    if second is not None:
-        arrays["_second"] = second
+    arrays: dict[str, Any] = {"": found.depth, "_target": found.target_probability, "_confidence": found.confidence}
+    arrays |= {"_significance": found.significance, "_second": second}
+    written = []
     for ending, values in arrays.items():
-        with atomic_path(folder / f"{name}{ending}.npy") as temporary, temporary.open("wb") as file:
-            np.save(file, values if read.frames else values[0])
+        if values is not None:
+            written.append(write_array(folder / f"{name}{ending}.npy", values if read.frames else values[0]))
     metadata = {"content": "denoised depth", "method": method, "frame": "+x right, +y down, +z forward"}
     channels = {"Z" if read.quantity == "depth" else "range": found.depth, "confidence": found.confidence}
     channels["target_probability"] = found.target_probability
     first = {channel: np.ascontiguousarray(values[0]) for channel, values in channels.items()}
-    return [*(folder / f"{name}{ending}.npy" for ending in arrays), write_exr(folder / f"{name}.exr", first, metadata)]
+    return [*written, write_exr(folder / f"{name}.exr", first, metadata)]
 
 
 def _count_frames(held: Histograms) -> CountFrames:

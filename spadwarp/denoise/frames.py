@@ -43,8 +43,7 @@ class DepthFrames:
 
         Missing ones get the nearest depth where those around them report nearly as often as elsewhere.
         """
-        images = map(_filled, self.scaled, self.density)
-        return np.stack([np.nan_to_num(image, nan=1.0) for image in images])
+        return np.nan_to_num(np.stack([*map(_filled, self.scaled, self.density)]), nan=1.0)
 
 
 def checked_gate(gate: tuple[float, float]) -> tuple[float, float]:
@@ -92,11 +91,8 @@ def depth_frames(
     slack = MARGIN * (stop - start)
     outside = present & ~((values >= start - slack) & (values <= stop + slack))
     if outside.any():
-        warnings.warn(
-            f"{outside.sum()} of {present.sum()} depths lie outside the gate of {start:g} to {stop:g} m and count as "
-            "not reported",
-            stacklevel=2,
-        )
+        text = f"{outside.sum()} of {present.sum()} depths lie outside the gate of {start:g} to {stop:g} m"
+        warnings.warn(f"{text} and count as not reported", stacklevel=2)
     values = np.where(present & ~outside, values, np.float32(np.nan))
     relative = np.ones_like(values)
     if density is not None:

@@ -109,9 +109,8 @@ class _Conv(nn.Conv3d):
         image, device = x.flatten(0, 1).permute(0, 3, 1, 2), x.device.type
         kind = torch.get_autocast_dtype(device) if torch.is_autocast_enabled(device) else x.dtype
         assert bias is not None
-        given = image.to(kind), filters.to(kind), bias.to(kind)
         convolved: Any = _Convolution.apply if len(image) > _MANY else partial(F.conv2d, padding=1)
-        found = convolved(*given)
+        found = convolved(image.to(kind), filters.to(kind), bias.to(kind))
         return found.permute(0, 2, 3, 1).unflatten(0, x.shape[:2])
 
 
@@ -181,15 +180,12 @@ class HistogramNet(nn.Module):
     Returns the logarithm of the probabilities, `[B, H, W, T]`, and the logit, `[B, H, W]`. Sizes may be any.
     """
 
-    def __init__(
-        self, widths: tuple[int, ...] = (16, 32, 48, 64), target_widths: tuple[int, ...] = (48, 64, 96)
-    ) -> None:
+    def __init__(self, widths: tuple[int, ...] = (16, 32, 48, 64)) -> None:
         super().__init__()
-        first = widths[0]
+        first, target_widths = widths[0], (48, 64, 96)
         self.enter = _Conv(_CELLS, first, (3, 3, 1))
-        self.enter_image = nn.Sequential(
-            nn.Conv2d(_IMAGES, 32, 3, padding=1), nn.ReLU(), nn.Conv2d(32, first, 3, padding=1)
-        )
+        layers = nn.Conv2d(_IMAGES, 32, 3, padding=1), nn.ReLU(), nn.Conv2d(32, first, 3, padding=1)
+        self.enter_image = nn.Sequential(*layers)
         self.pyramid = _Pyramid(widths, volumes=True)
         self.head = nn.Linear(first, _VOLUMES + 1)
         self.enter_target = _Conv(2 * first + _IMAGES, target_widths[0], (3, 3, 1))
@@ -227,11 +223,8 @@ class HistogramNet(nn.Module):
         parts = [self.enter(part.contiguous()) + image for part in cells.split(at_once, dim=1)]
         found = [(self.head(x), x.amax(dim=1, keepdim=True), x.sum(dim=1, keepdim=True)) for x in self.pyramid(parts)]
         heads, most, sums = (torch.cat(each, dim=1) for each in zip(*found, strict=True))
-        ends = (
-            most.amax(dim=1, keepdim=True),
-            sums.sum(dim=1, keepdim=True) / count,
-            images.permute(0, 2, 3, 1)[:, None],
-        )
+        whole = most.amax(dim=1, keepdim=True), sums.sum(dim=1, keepdim=True) / count
+        ends = *whole, images.permute(0, 2, 3, 1)[:, None]
         (target,) = self.target_pyramid([self.enter_target(torch.cat(ends, dim=-1))])
         return heads, self.target(target)[:, 0, ..., 0]
 
@@ -297,8 +290,7 @@ def light_channels(above: Tensor, background: Tensor, place: Tensor, response: T
     `above`: counts less the expected background, `[B, H, W, T]`; `background`: of each bin, mean over the frame,
     `[B, T]`; `place`: of each pixel's peak over the gate; `response`: `[B, 2 r + 1]`, sum 1.
     """
-    level = background.sum(dim=-1)[:, None, None]
-    excess = above.sum(dim=-1)
+    level, excess = background.sum(dim=-1)[:, None, None], above.sum(dim=-1)
     bright = _around(excess, 3).clamp_min(0.0)
     most = [_brightest(bright, reach) for reach in (_NEAR, _FAR)]
     parts = _near_and_late(above, place, response)
@@ -308,16 +300,14 @@ def light_channels(above: Tensor, background: Tensor, place: Tensor, response: T
         whole, *some = wide[4 * number : 4 * number + 4]
         noise = (whole.clamp_min(0.0) + level + 0.5).sqrt() / side
         shares += [(part / (whole.clamp_min(0.0) + noise)).clamp(-1.0, 2.0) for part in some]
-    weight = bright.square() + 1e-6
-    far = 2 * _FAR + 1
+    weight, far = bright.square() + 1e-6, 2 * _FAR + 1
     total = _around(weight, far)
     typical = [_around(weight * share, far) / total for share in shares[3:]]
-    own = excess.clamp_min(0.0)
     return [
         0.2 * (bright + 0.1).log(),
         0.2 * ((bright + 0.3) / (level + 0.3)).log(),
         *(0.3 * ((bright + 0.2) / (one + 0.2)).log() for one in most),
-        0.3 * ((own + 1.0) / (most[1] + 1.0)).log(),
+        0.3 * ((excess.clamp_min(0.0) + 1.0) / (most[1] + 1.0)).log(),
         *shares,
         *(share - one for share, one in zip(shares[3:], typical, strict=True)),
     ]
@@ -325,9 +315,8 @@ def light_channels(above: Tensor, background: Tensor, place: Tensor, response: T
 
 def _near_and_late(above: Tensor, place: Tensor, response: Tensor) -> list[Tensor]:
     """Excess within the nearer and the farther of `_REACHES` around the peak, and after the farther, `[B, H, W]`."""
-    bins = above.shape[-1]
     width = deviation(response, 0.25)[:, None, None]
-    cumulative, centre = above.cumsum(dim=-1), place * bins
+    cumulative, centre = above.cumsum(dim=-1), place * above.shape[-1]
     edges = [centre + sign * (reach * width + 0.5) for reach in _REACHES for sign in (-1.0, 1.0)]
     first, last, start, stop = interpolated(F.pad(cumulative, (1, 0)), torch.stack(edges, dim=-1)).unbind(dim=-1)
     return [last - first, stop - start, cumulative[..., -1] - stop]

@@ -75,11 +75,9 @@ def count_frames(counts: ArrayLike, background: ArrayLike | BackgroundLaw, respo
     taps = real_array("response", response)
     if taps.ndim != 1 or taps.size % 2 == 0 or not (np.isfinite(taps).all() and taps.sum() > 0):
         raise ArgumentError(f"response has shape {taps.shape}; an odd number of values centred on time zero is needed")
-    levels, one, each = real_array("background", background), cubes.shape[-1:], cubes.shape[-3:]
-    levels = levels if levels.ndim else np.broadcast_to(levels, one)
-    if levels.shape not in (one, each) or not (np.isfinite(levels).all() and (levels >= 0).all()):
-        raise ArgumentError(f"background has shape {levels.shape}; (), {one} or {each} is needed, of numbers >= 0")
-    return CountFrames(cubes, levels, taps)
+    one, each = cubes.shape[-1:], cubes.shape[-3:]
+    levels = real_array("background", background, shapes=((), one, each), within="[0, inf)")
+    return CountFrames(cubes, levels if levels.ndim else np.broadcast_to(levels, one), taps)
 
 
 def without_defects(counts: ArrayLike, background: ArrayLike | BackgroundLaw, response: ArrayLike) -> CountFrames:
@@ -131,10 +129,8 @@ def dim_pixels(histograms: Histograms) -> list[str]:
     it, as smooth as that of the target, where a camera would report nothing.
     """
     values, known = histograms.values, histograms.background_per_bin
-    signal, background = values.sum(axis=-1, dtype=np.float64), np.zeros(())
-    if known is not None:
-        background = known.sum(axis=-1, dtype=np.float64)
-        signal = signal - background
+    background = np.zeros(()) if known is None else known.sum(axis=-1, dtype=np.float64)
+    signal = values.sum(axis=-1, dtype=np.float64) - background
     dim = float(((signal < 0.05 * np.quantile(signal, 0.9)) & (signal > background)).mean())
     if dim < 0.01:
         return []
@@ -145,7 +141,6 @@ def dim_pixels(histograms: Histograms) -> list[str]:
 
 
 # Defects of a camera.
-
 
 FALSE_ALARMS = 1e-3
 """Probability that a frame without defects has one, of each kind of test."""
@@ -168,13 +163,10 @@ class Defects(NamedTuple):
     @property
     def summary(self) -> str:
         """One sentence for the user; "" without defects."""
-        lone = int(self.pixels.sum())
-        parts = [f"{lone} of {self.pixels.size} pixels"] if lone else []
-        parts += [f"{self.bins.sum()} of {self.bins.size} bins"] if self.bins.any() else []
-        if not parts:
-            return ""
+        kinds = ("pixels", self.pixels), ("bins", self.bins)
+        parts = " and ".join(f"{wrong.sum()} of {wrong.size} {kind}" for kind, wrong in kinds if wrong.any())
         whole = f" (whole rows or columns: {self.lines})" if self.lines else ""
-        return f"{' and '.join(parts)} are stuck, hot or dead and left out{whole}"
+        return parts and f"{parts} are stuck, hot or dead and left out{whole}"
 
     def hide(self, depth: NDArray[Any], gate: tuple[float, float], reach: int) -> NDArray[np.bool_]:
         """Which depths `[..., H, W]` [m] are of such a pixel, or less than `reach` / 2 bins from such a bin."""

@@ -102,9 +102,9 @@ def estimate(
     gate, depth = checked_gate(gate), depth_values(depth)
     if precision is not None:
         check_choice("precision", precision, get_args(Precision))
+    options: dict[str, Any] = {"model": model, "weights": weights, "device": device, "precision": precision}
     if model not in FROM_COUNTS:
-        options: dict[str, Any] = {"weights": weights, "device": device, "precision": precision, "progress": progress}
-        found = estimate_depth(depth, gate=gate, model=model, profile=profile, **options)
+        found = estimate_depth(depth, gate=gate, profile=profile, progress=progress, **options)
     else:
         if counts is None or response is None:
             raise ArgumentError(f"model = {model!r} needs counts and response, of which some are missing")
@@ -119,13 +119,8 @@ def estimate(
             depth = np.where(hidden, np.float32(np.nan), depth)
         bins, width = target_bins(frames), (gate[1] - gate[0]) / frames.counts.shape[-1]
         start, stop = gate[0] + bins.start * width, gate[0] + bins.stop * width
-
-        def to_depth(place: NDArray[np.float32]) -> NDArray[np.float32]:
-            return start + (stop - start) * place
-
-        options = {"weights": weights, "device": device, "precision": precision}
-        options |= {"bins": bins, "bin_width": width, "to_depth": to_depth}
-        found = estimate_histograms(depth, frames, model=model, **options)
+        options["to_depth"] = lambda place: start + (stop - start) * place
+        found = estimate_histograms(depth, frames, bins=bins, bin_width=width, **options)
         found = detected(found, frames, model=model, min_significance=min_significance)
     shaped: Any = (None if values is None else values.reshape(np.shape(depth)) for values in found)
     return Estimate(*shaped)
@@ -307,9 +302,7 @@ def estimate_frames(
     from spadwarp.denoise.networks import corrected_target, load_network, narrowed_input
 
     place = torch_device(device)
-    if model != "pyramid":
-        precision = "float32"
-    kind = precision or fast_precision(str(place))
+    kind = "float32" if model != "pyramid" else precision or fast_precision(str(place))
     network = load_network(model, weights, str(place), kind)
     inputs = None if model == "pyramid" else frames.filled()[:, None]
     begin, extent = frames.gate[0], frames.gate[1] - frames.gate[0]
@@ -392,8 +385,7 @@ def second_return(
             reach = 2 * round(1.5 * width) + 1
             known = level + torch.where(late, signal * _late_light(cube - level, signal, delay, late, reach), 0.0)
             rest = torch.where(near, known, cube - signal * shape).clamp_min(0.0)
-            image = torch.cat([rest, known])
-            image = pooled(image, side) * side**2
+            image = pooled(torch.cat([rest, known]), side) * side**2
             sums = torch.nn.functional.avg_pool1d(image.flatten(0, 2)[:, None], reach, 1, reach // 2)
             found_counts, expected = (sums.view_as(image) * reach).split(1)
             excess = torch.xlogy(found_counts, found_counts / expected) - (found_counts - expected)

@@ -13,7 +13,6 @@ from spadwarp.values import DeviceError, FileError, SpadwarpError, check_choice,
 
 __all__ = ["weights_metadata"]
 
-
 Precision = Literal["float16", "bfloat16", "float32"]
 """Of numbers in the layers of a network."""
 
@@ -30,10 +29,9 @@ def weights_metadata(model: str, weights: str | Path | None = None) -> dict[str,
     `weights`: the file; default: the package's for `model`. Raises `FileError`; `ArgumentError` for an unknown model.
     """
     path = weights_path(model, weights)
+    header = weights_header(path)
     try:
-        return {
-            name: parse_json(text) if text[:1] in ("{", "[") else text for name, text in weights_header(path).items()
-        }
+        return {name: parse_json(text) if text[:1] in ("{", "[") else text for name, text in header.items()}
     except ValueError as error:
         raise FileError(f"{path}: its header is damaged: {error}") from error
 

@@ -1,10 +1,10 @@
 """The networks: layers, USDN, DnCNN, and PyramidNet, which also sees the water's backscatter; its input from frames.
 
 All take `[batch, 3, height, width]`: depth over the gate (0 at its start, 1 at its end; 1 where nothing was reported),
-1 where the pixel reported something, and the logarithm of the backscatter's density at the reported depth (0 for a flat
-profile, see `spadwarp.denoise.synthetic_noise.log_density`). They return denoised depth over the gate,
-`[batch, 1, height, width]`; PyramidNet also three logits. Lengths in depth are in gate widths. The network for
-histograms is in `spadwarp.denoise.histogram_network`.
+1 where the pixel reported something, and the logarithm of the backscatter's density at the reported depth (mean 1; 0
+for a flat profile), within ±`LOG_DENSITY_LIMIT`. They return denoised depth over the gate, `[batch, 1, height, width]`;
+PyramidNet also three logits. Lengths in depth are in gate widths. The network for histograms is in
+`spadwarp.denoise.histogram_network`.
 """
 
 from __future__ import annotations
@@ -242,15 +242,14 @@ def neighbour_votes(depth: Tensor, reported: Tensor) -> Votes:
         y, x = (_BORDER + step for step in place)
         return values[..., y : y + height, x : x + width]
 
-    agreeing: dict[tuple[int, int], tuple[Tensor, Tensor]] = {}  # of all pixels with those so many rows, columns away
+    agreeing: dict[tuple[int, int], tuple[Tensor, ...]] = {}  # of all pixels with those so many rows, columns away
     # All images as one line, in which a neighbour is a fixed number of places away; what crosses a border is not used.
     line, row, pixels = image.flatten(), image.shape[3], image.numel()
     line = torch.cat([line, line[: 2 * row + 2]])
     for step in (place for place in _AROUND if place > (0, 0)):
         places = step[0] * row + step[1]
         apart = (line[:pixels] - line[places : places + pixels]).abs_().view_as(image)
-        fine, coarse = (torch.rsub(apart, 1.0, alpha=1.0 / most).clamp_min_(0.0) for most in (_SAME, _ALIKE))
-        agreeing[step] = fine, coarse
+        agreeing[step] = tuple(torch.rsub(apart, 1.0, alpha=1.0 / most).clamp_min_(0.0) for most in (_SAME, _ALIKE))
 
     def pair(one: tuple[int, int], other: tuple[int, int], kind: int = 0) -> Tensor:
         """Agreement of the pixels at two places beside each pixel."""
@@ -319,17 +318,14 @@ class PyramidNet(nn.Module):
 
     def __init__(self) -> None:
         super().__init__()
-        last = 8
-        widths = (4, 5, 8, 10, 14)  # features of the levels
-        pairs, deep = list(pairwise(widths)), len(widths) - 1
+        widths, last = (4, 5, 8, 10, 14), 8  # features of the levels, and of the heads
+        pairs = list(pairwise(widths))
         self.enter = SymmetricConv(6 + _SCALARS, widths[0], 3, lifts=True)
         self.enter_agreement = SymmetricConv(2, widths[0], 3, bias=False)
         self.down = nn.ModuleList(SymmetricConv(wide, narrow, 4, stride=2) for wide, narrow in pairs)
         self.up = nn.ModuleList(SymmetricConv(narrow, wide, 1, bias=False) for wide, narrow in pairs)
-        self.before = nn.ModuleList(
-            nn.Sequential(*(_Residual(width) for _ in range(1 + (level == deep - 1))))
-            for level, width in enumerate(widths[1:])
-        )
+        blocks = [*([width] for width in widths[1:-1]), [widths[-1]] * 2]  # their widths, by level below the first
+        self.before = nn.ModuleList(nn.Sequential(*map(_Residual, level)) for level in blocks)
         self.after = nn.ModuleList(_Residual(width) for width in widths[1:-1])
         self.finish = SymmetricConv(widths[0], widths[0], 3)
         self.polish = nn.ModuleList([_Residual(widths[0])])
@@ -380,31 +376,25 @@ class PyramidNet(nn.Module):
         ranked = [rank - depth for rank in ranks(depth)]
         scalars = [(depth - 0.5) * reported, reported, 0.25 * density, *ranked]
         scalars += [votes.near, votes.wide, votes.depth - depth, votes.support]
-        x = self._entered([(self.enter, torch.cat(scalars, dim=1)), (self.enter_agreement, votes.agreement)])
+        # One convolution of both images, whose channels are filled up to a multiple of eight.
+        filters = torch.cat([self.enter.expanded(), self.enter_agreement.expanded()], dim=1)
+        missing = -filters.shape[1] % 8
+        images = [torch.cat(scalars, dim=1).to(filters.dtype), votes.agreement.to(filters.dtype)]
+        images.append(filters.new_zeros(()).expand(len(frame), missing, *frame.shape[2:]))
+        filters = F.pad(filters, (0, 0, 0, 0, 0, missing)).contiguous(memory_format=torch.channels_last)
+        assert self.enter.bias is not None
+        bias = self.enter.bias.repeat_interleave(GROUP)
+        # In the precision of the layers, and with the channels of a pixel side by side.
+        image = torch.cat(images, dim=1).to(filters.dtype, memory_format=torch.channels_last)
+        x = F.conv2d(image, filters, bias, padding=self.enter.padding)
         skipped = []
         for down, before in zip(self.down, self.before, strict=True):
             skipped.append(x)
             x = before(down(F.relu(x)))
         for level in reversed(range(len(skipped))):
-            finer = enlarged(self.up[level](x), 2)
-            x = finer.add_(skipped[level])
+            x = enlarged(self.up[level](x), 2).add_(skipped[level])
             x = self.after[level - 1](x) if level else x + self.finish(F.relu(x))
-        for layer in self.polish:
-            x = layer(x)
-        return F.relu(self.spread(F.relu(x)), inplace=True)
-
-    def _entered(self, parts: list[tuple[SymmetricConv, Tensor]]) -> Tensor:
-        """The sum of convolutions of several images, as one; channels are filled up to a multiple of eight."""
-        filters = torch.cat([layer.expanded() for layer, _ in parts], dim=1)
-        images = [image.to(filters.dtype) for _, image in parts]
-        missing = -filters.shape[1] % 8
-        images.append(images[0].new_zeros(()).expand(len(images[0]), missing, *images[0].shape[2:]))
-        filters = F.pad(filters, (0, 0, 0, 0, 0, missing)).contiguous(memory_format=torch.channels_last)
-        assert self.enter.bias is not None
-        bias = self.enter.bias.repeat_interleave(GROUP)
-        # In the precision of the layers, and with the channels of a pixel side by side.
-        image = torch.cat(images, dim=1).to(self.enter.weight.dtype, memory_format=torch.channels_last)
-        return F.conv2d(image, filters, bias, padding=self.enter.padding)
+        return F.relu(self.spread(F.relu(self.polish[0](x))), inplace=True)
 
     def _heads(self, x: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
         """Weights of all depths, the network's own depth, the three logits and the reach of refining, `[B, n, H, W]`.
@@ -415,17 +405,13 @@ class PyramidNet(nn.Module):
         # Weights of the own depth and of the one voted for; then what is no weight. Slices, not a list of rows, which
         # would have to be copied to the GPU.
         order = [slice(0, 1), slice(-1, None), slice(1, 5), slice(5, 6)]
-        assert self.scalars.bias is not None
-        for rows in order:
-            weight = self.scalars.weight[rows, :, 0, 0].repeat_interleave(GROUP, 1) / GROUP
-            layers.append((weight, self.scalars.bias[rows]))
+        weight, bias = self.scalars.weight[..., 0, 0].repeat_interleave(GROUP, 1) / GROUP, self.scalars.bias
+        layers += [(weight[rows], bias[rows]) for rows in order]  # type: ignore[index]
         filters, biases = (torch.cat(parts) for parts in zip(*layers, strict=True))
         # The product of matrices gives rows of images, which what follows is faster with than with rows of channels.
         pixels = x.permute(0, 2, 3, 1).flatten(1, 2).transpose(1, 2)
         found = torch.baddbmm(biases[:, None], filters.expand(len(x), -1, -1), pixels).float()
-        found = found.unflatten(2, x.shape[2:])
-        weights, own, logits, reach = found.split([found.shape[1] - 5, 1, 3, 1], dim=1)
-        return weights, own, logits, reach
+        return found.unflatten(2, x.shape[2:]).split([found.shape[1] - 5, 1, 3, 1], dim=1)
 
 
 def _answer(weights: Tensor, trusts: Tensor, values: Tensor, reach: Tensor) -> Tensor:
@@ -524,8 +510,7 @@ def gates_of_target(depth: Tensor, density: Tensor) -> tuple[Tensor, Tensor, Ten
     inside = torch.where(reported, depth, torch.nan)
     share = reported.flatten(1).float().mean(dim=1)
     place = torch.where(reported, depth * _GATE_BINS, _GATE_BINS).long()
-    one = torch.ones((), device=depth.device)
-    pixels = _sums(one, place)
+    pixels = _sums(torch.ones((), device=depth.device), place)
 
     def unnoticed(observed: Tensor, expected: Tensor) -> Tensor:
         """How many bins there are before the first that begin an excess, `[N]`: a cumulative sum with resets."""
@@ -622,18 +607,15 @@ def corrected_target(logit: Tensor, depth: Tensor, reported: Tensor, share: Tens
     absent = depth.isnan()
     beyond = (reported < 0.5) & ~absent
 
-    def counts(chosen: Tensor) -> tuple[Tensor, Tensor]:
-        """Chosen pixels without a report, and with one outside that part of the gate, each `[N]`."""
-        return (chosen & absent).flatten(1).sum(1), (chosen & beyond).flatten(1).sum(1)
+    def without_report(chosen: Tensor, share: Tensor | float, pixels: float) -> Tensor:
+        """Part of the chosen pixels that are absent or beyond, and of `pixels` assumed with a `share`, `[N]`."""
+        none, some = ((chosen & kind).flatten(1).sum(1) for kind in (absent, beyond))
+        return (none + pixels * share) / (none + some + pixels)
 
-    none, some = counts(logit < _WATER)
-    water = (none + 0.5) / (none + some + 1.0)
-    none, some = counts(logit > 0.0)
-    target = (none + _PRIOR * water) / (none + some + _PRIOR)
-    of_absent, of_beyond = (
-        ratio.log().clamp(-_LARGEST, _LARGEST)[:, None, None]
-        for ratio in (target / water, (1.0 - target) / (1.0 - water))
-    )
+    water = without_report(logit < _WATER, 0.5, 1.0)
+    target = without_report(logit > 0.0, water, _PRIOR)
+    ratios = target / water, (1.0 - target) / (1.0 - water)
+    of_absent, of_beyond = (one.log().clamp(-_LARGEST, _LARGEST)[:, None, None] for one in ratios)
     logit = logit + torch.where(absent, of_absent, torch.where(beyond, of_beyond, 0.0))
     return logit + share.log().clamp_min(-_LARGEST)[:, None, None]
 

@@ -15,7 +15,6 @@ from spadwarp.scene.sections import Document, Section, Whole, field
 
 __all__ = ["TrainingRecipe", "load_training_recipe"]
 
-
 LEAST_CROP = 32
 """Side of the smallest crop that a network learns from [pixels]."""
 

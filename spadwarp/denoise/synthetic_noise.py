@@ -27,7 +27,6 @@ from spadwarp.denoise.recipe import Noise
 _THINGS = 10  # at most, in a scene
 _JITTER = 0.004  # deviation of a reported depth [m]; a recipe's sigma_scale multiplies it
 
-
 BINS = 64
 """Bins of a backscatter profile over the gate."""
 
@@ -108,8 +107,7 @@ def procedural_scenes(count: int, side: int, *, seed: int, device: torch.device 
                 paint[chosen] = torch.where(drawn, 0.5 * part.normal(1, 1), paint[chosen])
     metres = 15.0 + relief * (depth - 0.5)
     grain = 0.5 * random.uniform(1, 1) * random.coin(0.3, 1, 1) * random.normal(*depth.shape[1:])  # from pixel to pixel
-    texture = 0.5 * smooth_noise(random, side * finer) + 0.3 * _pattern(side, random, finer)
-    texture += paint + grain
+    texture = 0.5 * smooth_noise(random, side * finer) + 0.3 * _pattern(side, random, finer) + (paint + grain)
     if finer > 1:
         texture *= 1.0 - (2.0 * random.uniform(1, 1)).clamp_max(1.0) * random.coin(0.4, 1, 1)
     texture = texture.exp()
@@ -145,8 +143,7 @@ def _steepness(depth: Tensor) -> Tensor:
 
 def _background(side: int, random: Random, finer: int) -> Tensor:
     """Relative depth of what is behind: NaN (water), a wall about 1, or a floor that comes near at one side."""
-    count, device = random.size, random.generator.device
-    y, x = _turned(torch.zeros(count, 2, device=device), side, random, finer)
+    y, x = _turned(torch.zeros(random.size, 2, device=random.generator.device), side, random, finer)
     kind = random.uniform()[:, None, None]
     rough = 0.15 * random.uniform(1, 1) * random.coin(0.6, 1, 1) * smooth_noise(random, side * finer)
     slope = 0.6 * (2 * random.uniform(1, 1) - 1) * random.coin(0.7, 1, 1)
@@ -317,7 +314,6 @@ KINDS = (_plate, _ellipsoid, _rod, _rope, _net, _ladder, _plant, _chain, _rock, 
 
 # Crops, and the noise of a camera.
 
-
 COUNT_BINS = (64, 96, 128, 192, 256, 400)
 """Bins of the histograms behind frames with few photons, one number for each batch."""
 
@@ -378,14 +374,18 @@ def draw_batch(
     if counted:
         photons, sbr = random.log_between(noise.photons)[:counted], random.log_between(noise.sbr)[:counted]
         some = _Crops(*(values[:counted] for values in crops))
-        counts = _draw_counts(some, photons, photons / sbr, noise, generator, bins)
-        reported[:counted], present[:counted] = _estimate(*counts, photons)
+        counts, level, response = _draw_counts(some, photons, photons / sbr, noise, generator, bins)
+        # Log-likelihood of a return at bin k: Σ_j n_j ln(1 + S h_{j−k} / B_j), for all k at once.
+        gain = torch.log1p(photons[:, None, None] * toeplitz(response, bins) / level[:, :, None])  # [B, j, k]
+        reported[:counted] = highest(torch.bmm(counts.flatten(1, 2), gain).view_as(counts))
+        present[:counted] = counts.sum(dim=-1) > 0
     reported, present = _defects(reported, present, noise, random)
     reported = torch.where(present, reported, 1.0)
     known = torch.where(random.coin(noise.unknown_water)[:, None], 1.0, crops.profile)
     start, width = crops.camera[:, 0, None, None], crops.camera[:, 1, None, None]
-    density = torch.where(present, log_density(known, (reported - start) / width), 0.0)
-    frame = torch.stack([reported, present.float(), density], dim=1)
+    place = ((reported - start) / width * BINS).long().clamp(0, BINS - 1).flatten(1)
+    density = known.gather(1, place).clamp(math.exp(-LOG_DENSITY_LIMIT), math.exp(LOG_DENSITY_LIMIT)).view_as(reported)
+    frame = torch.stack([reported, present.float(), torch.where(present, density.log(), 0.0)], dim=1)
     return Batch((frame,), crops.clean[:, None], hit)
 
 
@@ -409,8 +409,7 @@ def _report(crops: _Crops, noise: Noise, random: Random, always_replaced: bool) 
     rate = torch.where(kind < 0.1, 0.0, torch.where(kind > 0.9, 1.0, rate))
     share = torch.where(hit | (kind.sub(0.5).abs() < 0.25), share, rate)
     replaced = random.uniform(*clean.shape[1:]) < share
-    backscatter = _backscatter_depth(profile, (reach - start) / width, random.uniform(*clean.shape[1:]))
-    backscatter = start + width * backscatter
+    backscatter = start + width * _backscatter_depth(profile, (reach - start) / width, random.uniform(*clean.shape[1:]))
     # A gate opens at one range, which is nearer in depth towards the corners of the view.
     nearer = torch.where(random.coin(noise.slanted_gate), 0.15 * random.uniform(), 0.0)[:, None, None]
     reported = torch.where(replaced, backscatter - nearer * (1.0 - backscatter), reported)
@@ -430,13 +429,6 @@ def _defects(reported: Tensor, present: Tensor, noise: Noise, random: Random) ->
     return reported, present & (reported > -MARGIN) & (reported < 1.0 + MARGIN)
 
 
-def log_density(profile: Tensor, depth: Tensor) -> Tensor:
-    """ln of the profiles `[B, bins]` (mean 1) at depths over the gate `[B, H, W]`, within ±`LOG_DENSITY_LIMIT`."""
-    bins, limit = profile.shape[1], LOG_DENSITY_LIMIT
-    place = (depth.flatten(1) * bins).long().clamp(0, bins - 1)
-    return profile.gather(1, place).clamp(math.exp(-limit), math.exp(limit)).log().view_as(depth)
-
-
 def _draw_crops(scenes: CleanScenes, noise: Noise, crop: int, random: Random, finer: int) -> _Crops:
     """Crops of random scenes, each with a gate and a water."""
     index = random.integer(len(scenes.depth))
@@ -451,8 +443,7 @@ def _draw_crops(scenes: CleanScenes, noise: Noise, crop: int, random: Random, fi
     own = random.coin(noise.own_gate)
     low, high = _extent(depth, hit, gate)
     width = torch.maximum(random.log_between(noise.gate_width), 1.02 * (high - low))
-    start = low - (width - (high - low)) * random.uniform()
-    start = torch.where(own, gate[:, 0], start)
+    start = torch.where(own, gate[:, 0], low - (width - (high - low)) * random.uniform())
     width = torch.where(own, gate[:, 1] - gate[:, 0], width)
     if noise.cut > 0.0:
         end = torch.lerp(low, high, random.between((0.5, 1.0)))
@@ -607,18 +598,13 @@ def _draw_counts(
 
     second, share = _second_surface(clean, hit, noise, random)
     rate = torch.zeros(*clean.shape, bins, device=device)
-
-    def add(depth: Tensor, signal: Tensor) -> None:
-        """Shares a return among the two bins whose middles are next to it."""
+    signals = *(signal * (1.0 - share) for signal in each.unbind(dim=1)), shade * share
+    for depth, signal in zip((*seen.unbind(dim=1), second), signals, strict=True):
         at = (depth.nan_to_num(-9.0) * bins - 0.5)[..., None]
-        near = at.floor() + edges[:2]
+        near = at.floor() + edges[:2]  # the two bins whose middles are next to the return share it
         part = (signal * photons[:, None, None])[..., None] * (1.0 - (near - at).abs())
         inside = (near >= 0) & (near < bins)
         rate.scatter_add_(-1, near.long().clamp(0, bins - 1), torch.where(inside, part, 0.0))
-
-    for depth, signal in zip(seen.unbind(dim=1), each.unbind(dim=1), strict=True):
-        add(depth, signal * (1.0 - share))
-    add(second, shade * share)
     scattered = round(noise.scattered * len(clean))
     if scattered:
         rate[:scattered] = _scattered(rate[:scattered], photons[:scattered], noise, generator)
@@ -629,17 +615,11 @@ def _draw_counts(
     level = level * torch.where(random.coin(noise.wrong, 1), random.log_between(_WRONG, 1), 1.0)
     height, slope = (random.normal(1) * random.coin(0.5, 1) for _ in range(2))
     level = level * torch.exp(_ESTIMATED[0] * height + _ESTIMATED[1] * slope * (place - 0.5))
-    return _in_halves(counts, level, given, random.coin(noise.halves, 1))
-
-
-def _in_halves(counts: Tensor, level: Tensor, response: Tensor, chosen: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-    """The arguments, chosen samples `[B, 1]` as those of a camera with bins twice as wide, which `halved` gives."""
-    counted, known, taps = halved(*rebinned(counts, level, response, 2))
-    return (
-        torch.where(chosen[..., None, None], counted, counts),
-        torch.where(chosen, known, level),
-        torch.where(chosen, taps[:, 1:-1], response),
-    )
+    # Chosen samples are as those of a camera with bins twice as wide, which `halved` gives.
+    chosen = random.coin(noise.halves, 1)
+    counted, known, taps = halved(*rebinned(counts, level, given, 2))
+    counts, level = torch.where(chosen[..., None, None], counted, counts), torch.where(chosen, known, level)
+    return counts, level, torch.where(chosen, taps[:, 1:-1], given)
 
 
 def _second_surface(clean: Tensor, hit: Tensor, noise: Noise, random: Random) -> tuple[Tensor, Tensor]:
@@ -655,14 +635,6 @@ def _second_surface(clean: Tensor, hit: Tensor, noise: Noise, random: Random) ->
     there = hit & torch.where(beside, hit.roll(1, 2) & ((second - clean).abs() > 0.005), veiled)
     share = torch.where(beside, random.between((0.0, 0.45), *clean.shape[1:]), random.between((0.05, 0.45), 1, 1))
     return second, torch.where(there & random.coin(noise.two_returns, 1, 1), share, 0.0)
-
-
-def _estimate(counts: Tensor, level: Tensor, response: Tensor, photons: Tensor) -> tuple[Tensor, Tensor]:
-    """Maximum-likelihood depth over the gate, and where there are counts."""
-    # Log-likelihood of a return at bin k: Σ_j n_j ln(1 + S h_{j−k} / B_j), for all k at once as a product of matrices.
-    gain = torch.log1p(photons[:, None, None] * toeplitz(response, counts.shape[-1]) / level[:, :, None])  # [B, j, k]
-    score = torch.bmm(counts.flatten(1, 2), gain).view_as(counts)
-    return highest(score), counts.sum(dim=-1) > 0
 
 
 def _scattered(rate: Tensor, photons: Tensor, noise: Noise, generator: torch.Generator) -> Tensor:

@@ -30,8 +30,8 @@ from spadwarp.denoise.network_files import torch_device
 from spadwarp.denoise.networks import NETWORKS, load_network
 from spadwarp.denoise.recipe import LEAST_CROP, LEVELS, Noise, Part, TrainingRecipe
 from spadwarp.denoise.synthetic_noise import COUNT_BINS, SUBPIXELS, Batch, CleanScenes, draw_batch, procedural_scenes
-from spadwarp.io.paths import atomic_path
-from spadwarp.io.text import duration
+from spadwarp.io.paths import write_file
+from spadwarp.io.text import duration, write_text
 from spadwarp.parallel import interruptible
 from spadwarp.values import ConfigError, FileError
 
@@ -165,8 +165,7 @@ def histogram_loss(log_probability: Tensor, target: Tensor, batch: Batch) -> Ten
     middle = (clean * bins).long().clamp(0, bins - 1)[..., None]
     middle = (middle + torch.arange(-1, 2, device=middle.device)).clamp(0, bins - 1)
     right = log_probability.gather(-1, middle).exp().sum(dim=-1)
-    entropy = -torch.log(right + _OUTLIER)
-    entropy = (hit * entropy).flatten(1).sum(dim=1) / pixels
+    entropy = (hit * -torch.log(right + _OUTLIER)).flatten(1).sum(dim=1) / pixels
     error = _mean_with_target(0.5 * torch.log(square + _FINE_FLOOR) + _BINS * entropy, hit)
     return error + _SEEN * F.binary_cross_entropy_with_logits(target, hit)
 
@@ -252,24 +251,20 @@ def _learning_rate(step: int, recipe: TrainingRecipe) -> float:
 
 def _difference(stored: Any, recipe: TrainingRecipe) -> str:
     """In which fields the recipe of a checkpoint, a text, differs from this one."""
+
+    def fields(text: Any) -> dict[str, Any]:  # by name, those of a table as `optimiser.steps`
+        tables = {name: one if isinstance(one, dict) else {"": one} for name, one in json.loads(text).items()}
+        return {f"{name}.{one}".rstrip("."): value for name, table in tables.items() for one, value in table.items()}
+
     try:
-        before, now = _fields(json.loads(stored)), _fields(recipe.model_dump(mode="json"))
+        before, now = fields(stored), fields(recipe.model_dump_json())
     except (AttributeError, TypeError, ValueError):  # no recipe of ours
         return ""
     names = [name for name in now if before.get(name) != now[name]]
-    parts = [
-        f"{name} = {before.get(name)}, here {now[name]}" if name != "mixture" else "mixture" for name in names[:3]
-    ] + ["…"] * (len(names) > 3)
+    parts = [f"{one} = {before.get(one)}, here {now[one]}" if one != "mixture" else one for one in names[:3]]
+    parts += ["…"] * (len(names) > 3)
     why = "; its learning rate decreases over all steps" if names == ["optimiser.steps"] else ""
     return f" ({'; '.join(parts)}{why})" if parts else ""
-
-
-def _fields(tables: dict[str, Any]) -> dict[str, Any]:
-    """Values by name, those of a table as `optimiser.steps`."""
-    named: dict[str, Any] = {}
-    for name, value in tables.items():
-        named |= {f"{name}.{one}": inner for one, inner in value.items()} if isinstance(value, dict) else {name: value}
-    return named
 
 
 class Run:
@@ -290,14 +285,12 @@ class Run:
         self.rate = torch.zeros((), device=device)  # which recorded steps read
         common: dict[str, Any] = {"lr": self.rate if is_cuda else 0.0, "weight_decay": recipe.optimiser.weight_decay}
         matrices, others = ([p for p in network.parameters() if _is_matrix(p) == one] for one in (True, False))
-        self.optimisers = (
-            Muon(matrices, common),
-            torch.optim.AdamW(others, betas=(0.9, 0.99), fused=is_cuda, capturable=is_cuda, **common),
-        )
+        adam = torch.optim.AdamW(others, betas=(0.9, 0.99), fused=is_cuda, capturable=is_cuda, **common)
+        self.optimisers = Muon(matrices, common), adam
         self.generator = torch.Generator(device).manual_seed(recipe.seed * 1009)
         self.samples = Samples(recipe, self.generator, given)
-        self.state = {"network": self.network, "average": self.average}
-        self.state |= dict(zip(("matrices", "others"), self.optimisers, strict=True))
+        states = self.network, self.average, *self.optimisers
+        self.state = dict(zip(("network", "average", "matrices", "others"), states, strict=True))
         self.loss_sum = torch.zeros((), device=device)  # of the steps since the last report
         self.step, spent = self._resume()
         self.graphs: dict[Any, tuple[Any, Tensor] | None] = {}  # recorded steps and losses, of samples of a kind
@@ -317,10 +310,8 @@ class Run:
             raise FileError(f"{self.checkpoint}: damaged; remove it to start anew ({type(error).__name__})") from error
         stored = kept.get("recipe") if isinstance(kept, dict) else None
         if stored != self.recipe.model_dump_json():
-            raise ConfigError(
-                f"{self.checkpoint} belongs to another recipe{_difference(stored, self.recipe)}; choose another folder "
-                "with --out, or remove this file to start anew"
-            )
+            text = f"{self.checkpoint} belongs to another recipe{_difference(stored, self.recipe)}"
+            raise ConfigError(f"{text}; choose another folder with --out, or remove this file to start anew")
         try:
             for name, part in self.state.items():
                 part.load_state_dict(kept[name])
@@ -329,8 +320,7 @@ class Run:
             self.loss_sum += float(kept["loss_sum"])
         except (LookupError, TypeError, ValueError, AttributeError, RuntimeError) as error:
             raise FileError(f"{self.checkpoint}: not whole; remove it to start anew: {error}") from error
-        with atomic_path(self.log) as temporary:  # without a line that was written after the checkpoint
-            temporary.write_text(log)
+        write_text(log, self.log)  # without a line that was written after the checkpoint
         return step, spent
 
     def report(self, psnr: dict[float, float], input_psnr: float) -> None:
@@ -377,8 +367,7 @@ class Run:
     def _capture(self) -> None:
         """Records a step as a CUDA graph; where that fails, training goes on step by step."""
         self.samples.hold()
-        kind = self.samples.kind
-        graph = torch.cuda.CUDAGraph()
+        kind, graph = self.samples.kind, torch.cuda.CUDAGraph()
         torch.cuda.synchronize()
         self.graphs[kind] = None
         try:
@@ -395,8 +384,7 @@ class Run:
     def _work(self) -> Tensor:
         self.network.train()
         batch = self.samples.batch()
-        is_cuda = self.side is not None
-        with torch.autocast(self.device.type, dtype=torch.bfloat16, enabled=is_cuda, cache_enabled=False):
+        with torch.autocast(self.device.type, torch.bfloat16, enabled=self.side is not None, cache_enabled=False):
             output = self.network(*batch.inputs)
         loss = histogram_loss(output[0], output[1], batch) if self.counting else loss_of(output.float(), batch)
         self.network.zero_grad(set_to_none=True)
@@ -412,8 +400,7 @@ class Run:
         kept.update(recipe=self.recipe.model_dump_json(), random=self.generator.get_state(), step=self.step)
         kept.update(loss_sum=float(self.loss_sum), seconds=time.monotonic() - self.began)
         kept["log"] = self.log.read_text() if self.log.is_file() else ""
-        with atomic_path(self.checkpoint) as temporary:
-            torch.save(kept, temporary)
+        write_file(self.checkpoint, lambda file: torch.save(kept, file))
 
     def finish(self, psnr: dict[float, float], input_psnr: float) -> Trained:
         """Writes the weights, the running mean of the network, as float16 with metadata in the file's header."""
@@ -424,15 +411,12 @@ class Run:
         levels = {f"{level:.3f}": round(value, 2) for level, value in psnr.items()}
         metadata |= {"validation_psnr": json.dumps(levels), "hours": f"{seconds / 3600:.3f}"}
         metadata["machine"] = torch.cuda.get_device_name() if self.side is not None else "CPU"
-        values = {
-            name: (value.half() if value.is_floating_point() else value).contiguous().cpu()
-            for name, value in self.average.state_dict().items()
-        }
-        weights = self.folder / f"{recipe.model}.safetensors"
-        with atomic_path(weights) as temporary:
-            temporary.write_bytes(save(values, metadata=metadata))
-        psnrs = {"psnr": fmean(psnr.values()), "input_psnr": input_psnr}
-        return Trained(weights=weights, log=self.log, seconds=seconds, **psnrs)
+        states = self.average.state_dict().items()
+        values = {name: (one.half() if one.is_floating_point() else one).contiguous().cpu() for name, one in states}
+        whole = save(values, metadata=metadata)
+        weights = write_file(self.folder / f"{recipe.model}.safetensors", lambda file: file.write(whole))
+        mean = fmean(psnr.values())
+        return Trained(weights=weights, log=self.log, seconds=seconds, psnr=mean, input_psnr=input_psnr)
 
 
 # The loop.
@@ -477,8 +461,7 @@ def fit(
     Ctrl-C or SIGTERM end the run after the step at hand with a checkpoint and a KeyboardInterrupt that names it. Raises
     `ConfigError`, also where a crop is larger than the scenes.
     """
-    place = torch_device(device)
-    settings = recipe.optimiser
+    place, settings = torch_device(device), recipe.optimiser
     if training is not None:
         height, width = training.depth.shape[1:]
         scale, why = (2, f" with optimiser.wide = {settings.wide}") if settings.wide else (1, "")
@@ -513,10 +496,8 @@ def fit(
                 progress("steps", run.step, settings.steps)
         if run.step < settings.steps:
             run.save_checkpoint()
-            raise KeyboardInterrupt(
-                f"interrupted at step {run.step} of {settings.steps}; the same command resumes from {run.checkpoint}; "
-                "another number of steps needs a new folder"
-            )
+            text = f"interrupted at step {run.step} of {settings.steps}; the same command resumes from {run.checkpoint}"
+            raise KeyboardInterrupt(f"{text}; another number of steps needs a new folder")
     return run.finish(psnr or validation_psnr(run.average, validation, recipe), input_psnr)
 
 
