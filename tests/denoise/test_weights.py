@@ -51,7 +51,7 @@ def test_pyramid_beats_the_median_and_knows_where_no_target_is():
     assert np.mean(seen[0] == np.isfinite(HALF)) > 0.97
 
 
-@pytest.mark.parametrize("shape", [(32, 32), (41, 67), (8, 100)])
+@pytest.mark.parametrize("shape", [(1, 1), (2, 5), (41, 67), (8, 100)])
 @of_depth
 def test_frames_of_any_size_are_denoised_independently(model, shape):
     frames = np.stack([noisy_frame(np.full(shape, 15.0), seed=seed) for seed in range(2)])
@@ -262,7 +262,7 @@ HISTOGRAMS = {"counts": np.zeros((16, 16, 8)), "background": np.ones(8), "respon
 REFUSED = {
     r"depth has shape \(5,\)": {"depth": np.zeros(5)},
     "depth is <U1": {"depth": np.full((16, 16), "a")},
-    "4 x 40 pixels": {"depth": np.ones((4, 40))},
+    "at least one frame of one pixel": {"depth": np.ones((0, 40))},
     "outside": {"depth": -np.ones((16, 16))},
     r"gate = \(16.0, 13.5\) m is not \(start, stop\)": {"gate": (16.0, 13.5)},
     "gate": {"gate": (1.0, np.inf)},
