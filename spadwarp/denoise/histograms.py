@@ -225,8 +225,11 @@ def _wrong_pixels(
         """Of the lines along an axis, without the pixels that are known to be wrong."""
         if pixels.shape[1 - axis] <= _AROUND:
             return np.zeros(pixels.shape[1 - axis], bool)
-        counts = sums[axis].copy()
-        np.subtract.at(counts, np.nonzero(pixels)[1 - axis], cube[pixels])
+        counts, place = sums[axis].copy(), np.nonzero(pixels)[1 - axis]
+        line, first = np.unique(np.sort(place), return_index=True)
+        if line.size:
+            known = cube[pixels][np.argsort(place, kind="stable")]
+            counts[line] -= np.add.reduceat(known, first, axis=0, dtype=np.int64)
         return _wrong(counts, (each * ~pixels).sum(axis=axis), shape, most, width)
 
     lines = 0
