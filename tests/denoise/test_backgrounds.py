@@ -204,6 +204,16 @@ def test_in_a_bin_wider_than_the_response_the_light_of_a_pixel_says_where():
         assert np.median(found.depth) == pytest.approx(4.05, abs=1e-4)
 
 
+@pytest.mark.parametrize(("pitch", "unsure"), [(40.0, False), (5.0, True)])
+def test_depths_of_which_the_network_is_unsure_are_named(tmp_path, pitch, unsure):
+    """A folded sheet, seen aslant: 2 cm, or 20 cm, from pixel to pixel."""
+    y, x = np.mgrid[:64, :64]
+    sheet = 13.7 + np.abs((0.6 * x + 0.8 * y) / pitch % 2 - 1)
+    np.save(tmp_path / "sheet.npy", sheet + np.random.default_rng(1).normal(0.0, 0.004, sheet.shape))
+    found = denoise_file(tmp_path / "sheet.npy", tmp_path / "out", gate=(13.5, 16.0), device="cpu")
+    assert any(note.startswith("unsure: half of the depths") for note in found.notes) == unsure
+
+
 def test_frames_that_denoising_makes_worse_are_named(tmp_path):
     """Noise of 1 mm before a wall: USDN moves pixels by centimetres. In open water with backscatter none is worse."""
     generator = np.random.default_rng(1)
