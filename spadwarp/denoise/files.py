@@ -384,7 +384,7 @@ def denoise_file(
     notes += _worse(read.depth, depth, model, gate)
     target = found.target_probability >= threshold
     if target.any() and (sure := float(np.median(found.confidence[target]))) < 0.5:
-        notes.append(f"unsure: half of the depths of targets have a confidence below {sure:.2f} (NAME_confidence.npy)")
+        notes.append(f"unsure: half of the targets' depths have a confidence below {sure:.2f} ({name}_confidence.npy)")
     if model == "usdn" and weights is None:
         notes.append("usdn, for comparison: its depths are off by 1 to 3 cm even without noise; pyramid is better")
     style: dict[str, Any] = {"quantity": read.quantity, "title": f"{Path(path).name}: {model}"}

@@ -53,7 +53,7 @@ def rebinned(counts: Tensor, background: Tensor, response: Tensor, merged: int) 
 
 
 def halved(counts: Tensor, background: Tensor, response: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-    """The arguments in bins of half the width, of which two share the counts: depths differ by less than a bin."""
+    """The arguments in bins of half the width, of which two share the counts, so that depths may differ within one."""
     counts, background = (0.5 * torch.stack([values, values], dim=-1).flatten(-2) for values in (counts, background))
     between = 0.5 * (F.pad(response, (1, 0)) + F.pad(response, (0, 1)))
     response = torch.stack([between, F.pad(response, (0, 1))], dim=-1).flatten(1)[:, :-1]

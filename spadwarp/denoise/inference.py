@@ -232,8 +232,7 @@ def _by_network(
     height, width, bins = frames.shape[1:]
     found = np.empty((3, *frames.shape[:3]), np.float32)
     network, merged = load_network("histograms", weights, str(place)), merged_bins(bins, given.response)
-    if (kind := precision or fast_precision(str(place))) == "float16" and precision is None:
-        kind = "float32"
+    kind = precision or (fast_precision("cpu") if place.type == "cpu" else "float32")
     layers = torch.autocast(place.type, dtype=getattr(torch, kind), enabled=kind != "float32")
     most = max(_LEAST_PART, math.isqrt(int(_AT_ONCE * merged / bins)) - 2 * _MARGIN)
     with torch.inference_mode():
@@ -380,10 +379,10 @@ def second_return(
             shape = toeplitz(taps, bins)[0].t()[at]  # of the first return in each pixel
             delay = torch.arange(bins, device=cube.device) - at[..., None]
             near = delay.abs() <= 3.0 * width + 1.0
-            signal = ((cube - level) * near).sum(dim=-1, keepdim=True).clamp_min(0.0)
-            late = ~near & (delay > 0)
+            above, late = cube - level, ~near & (delay > 0)
+            signal = (above * near).sum(dim=-1, keepdim=True).clamp_min(0.0)
             reach = 2 * round(1.5 * width) + 1
-            known = level + torch.where(late, signal * _late_light(cube - level, signal, delay, late, reach), 0.0)
+            known = level + torch.where(late, signal * _late_light(above, signal, delay, late, reach), 0.0)
             rest = torch.where(near, known, cube - signal * shape).clamp_min(0.0)
             image = pooled(torch.cat([rest, known]), side) * side**2
             sums = torch.nn.functional.avg_pool1d(image.flatten(0, 2)[:, None], reach, 1, reach // 2)

@@ -615,11 +615,12 @@ def _draw_counts(
     level = level * torch.where(random.coin(noise.wrong, 1), random.log_between(_WRONG, 1), 1.0)
     height, slope = (random.normal(1) * random.coin(0.5, 1) for _ in range(2))
     level = level * torch.exp(_ESTIMATED[0] * height + _ESTIMATED[1] * slope * (place - 0.5))
-    # Chosen samples are as those of a camera with bins twice as wide, which `halved` gives.
-    chosen = random.coin(noise.halves, 1)
-    counted, known, taps = halved(*rebinned(counts, level, given, 2))
-    counts, level = torch.where(chosen[..., None, None], counted, counts), torch.where(chosen, known, level)
-    return counts, level, torch.where(chosen, taps[:, 1:-1], given)
+    if noise.halves > 0.0:  # chosen samples are those of a camera with bins twice as wide, in halves
+        chosen = random.coin(noise.halves, 1)
+        counted, known, taps = halved(*rebinned(counts, level, given, 2))
+        counts, level = torch.where(chosen[..., None, None], counted, counts), torch.where(chosen, known, level)
+        given = torch.where(chosen, taps[:, 1:-1], given)
+    return counts, level, given
 
 
 def _second_surface(clean: Tensor, hit: Tensor, noise: Noise, random: Random) -> tuple[Tensor, Tensor]:

@@ -73,7 +73,7 @@ class Samples:
         if self.histograms:
             host = np.random.default_rng((self.recipe.seed, 0, step))
             self.part = self.parts[host.choice(len(self.parts), p=[part.share for part in self.parts])]
-            often = np.array(COUNT_BINS) ** -0.5  # many bins take as much more time
+            often = np.array(COUNT_BINS) ** -0.5  # many bins take more time
             self.bins = int(host.choice(COUNT_BINS, p=often / often.sum()))
             if host.random() < self.part.open_water:
                 now = in_open_water(now)
